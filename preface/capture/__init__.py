@@ -1,0 +1,1 @@
+"""Captures on disk: manifests and their folders, images, boards and rigs. Nothing here knows of faces."""

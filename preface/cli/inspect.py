@@ -1,0 +1,273 @@
+"""``preface-inspect``: validate artefacts, summarise them, and say what is wrong with them."""
+
+import json
+import os
+import sys
+from argparse import ArgumentParser
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from preface.artifacts import ArtifactError, load_json, read_artifact
+from preface.plain_words import shown, suggestion
+
+if TYPE_CHECKING:  # these need numpy; --help must not wait for it
+    from preface.capture.images import ImageHeader
+    from preface.capture.manifest import Capture
+
+_DESCRIPTION = "Validate captures, rigs and reports, print what they hold, and say what is wrong with them."
+_EPILOG = "Exit status: 0 when all is well, 1 when something is wrong, 2 for wrong usage."
+_PATH_HELP = "an artefact, or a folder with a capture.json, a rig.json or the standard capture layout"
+MAX_LISTED = 20  # problems and missing views beyond this are counted; --json lists them all
+
+
+@dataclass
+class Report:
+    """What one artefact holds and what is wrong with it.
+
+    Attributes:
+        path: the artefact.
+        schema: its schema, None when that could not be determined.
+        summary: what it holds, JSON types, for people and programs.
+        problems: everything wrong that was found.
+    """
+
+    path: Path
+    schema: str | None = None
+    summary: dict[str, Any] = field(default_factory=dict)
+    problems: list[ArtifactError] = field(default_factory=list)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command and return its exit status."""
+    parser = ArgumentParser("preface-inspect", description=_DESCRIPTION, epilog=_EPILOG)
+    parser.add_argument("paths", metavar="PATH", nargs="+", type=Path, help=_PATH_HELP)
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    config = parser.parse_args(arguments)
+    reports = [report for path in config.paths for report in inspect(path)]
+    text = _as_json(reports) if config.json else _as_text(reports)
+    problems = [problem for report in reports for problem in report.problems]
+    status = 1 if problems else 0
+    if not _print(text):
+        return 1
+    if not config.json:
+        for problem in problems[:MAX_LISTED]:
+            print(_printable(str(problem), sys.stderr), file=sys.stderr)
+        if len(problems) > MAX_LISTED:
+            print(f"... and {len(problems) - MAX_LISTED} more problems; --json lists all", file=sys.stderr)
+    return status
+
+
+def inspect(path: Path) -> list[Report]:
+    """Inspect one artefact, or all those of a folder."""
+    try:
+        return [_inspect_artifact(report) for report in _artifacts(path)]
+    except ArtifactError as error:
+        return [Report(path, problems=[error])]
+    except OSError as error:
+        return [Report(path, problems=[ArtifactError.from_os(path, "file", error)])]
+
+
+def _artifacts(path: Path) -> list[Report]:
+    """Empty reports for the artefacts at a path; in a folder, their names say their schemas."""
+    if not path.is_dir():
+        return [Report(path)]
+    found = [Report(path / f"{kind}.json", f"preface/{kind}") for kind in ("capture", "rig")]
+    found = [report for report in found if os.path.lexists(report.path)]
+    if (path / "subjects").is_dir() and not os.path.lexists(path / "capture.json"):
+        found.insert(0, Report(path, "preface/capture"))  # its manifest is inferred
+    if not found:
+        problem = "holds neither a capture.json nor a rig.json nor a folder subjects"
+        raise ArtifactError(path, "folder", problem, "Name an artefact or the folder that holds it")
+    return found
+
+
+def _inspect_artifact(report: Report) -> Report:
+    summarise: Mapping[str, Callable[[Report], None]] = {
+        "preface/capture": _summarise_capture,
+        "preface/rig": _summarise_rig,
+        "preface/report": _summarise_report,
+    }
+    try:
+        if report.schema is None:
+            declared = load_json(report.path).get("schema")
+            if not isinstance(declared, str) or declared not in summarise:
+                problem = f"{shown(declared)} is not a kind of artefact that preface knows"
+                raise ArtifactError(report.path, "schema", problem, suggestion(declared, summarise))
+            report.schema = declared
+        summarise[report.schema](report)
+    except ArtifactError as error:
+        report.problems.append(error)
+    return report
+
+
+# ---------------------------------------------------------------------------------------- captures
+
+
+def _summarise_capture(report: Report) -> None:
+    from preface.capture.manifest import read_capture
+
+    capture = read_capture(report.path)
+    manifest = capture.manifest
+    headers = _check_images(capture, report.problems)
+    formats = Counter(f"{h.width}x{h.height} {h.format}, {h.channels} channels" for h in headers)
+    report.summary = {
+        "manifest": "inferred from the layout" if capture.inferred else "capture.json",
+        "cameras": [camera.id for camera in manifest.cameras],
+        "boards": [
+            f"{b.id}: {b.type} {b.squares[0]}x{b.squares[1]}, {b.square_size} m" for b in manifest.boards
+        ],
+        "takes": [
+            {
+                "id": take.id,
+                "background": take.background,
+                "board": board.id if (board := manifest.board_of(take)) else None,
+                "calibration_files": sum(
+                    len(capture.calibration_files(take, c.id)) for c in manifest.cameras
+                ),
+                "plates": sum((take.id, camera.id) in capture.plates for camera in manifest.cameras),
+            }
+            for take in manifest.takes
+        ],
+        "subjects": [subject.id for subject in manifest.subjects],
+        "images": len(capture.images),
+        "masks": len(capture.masks),
+        "formats": [f"{count} x {kind}" for kind, count in sorted(formats.items())],
+        "missing_views": [f"{subject}/{camera}" for subject, camera in capture.missing_views],
+    }
+
+
+def _check_images(capture: "Capture", problems: list[ArtifactError]) -> list["ImageHeader"]:
+    """Read the header of every image, mask and plate; all of one camera must have one size."""
+    from preface.capture.images import ImageError, read_header
+
+    sizes = {c.id: (c.width, c.height, "capture.json") for c in capture.manifest.cameras if c.width}
+    image_headers = []
+    for files in (capture.images, capture.masks, capture.plates):
+        for (_, camera), file in files.items():
+            try:
+                header = read_header(file)
+            except ArtifactError as error:
+                problems.append(error)
+                continue
+            if files is capture.images:
+                image_headers.append(header)
+            width, height, source = sizes.setdefault(camera, (header.width, header.height, str(file)))
+            if (header.width, header.height) != (width, height):
+                problem = (
+                    f"is {header.width}x{header.height}, but {source} says {width}x{height} for '{camera}'"
+                )
+                remedy = "All images of a camera have one size: correct the image or the manifest"
+                problems.append(ImageError(file, "size", problem, remedy))
+    return image_headers
+
+
+# -------------------------------------------------------------------------------------------- rigs
+
+
+def _summarise_rig(report: Report) -> None:
+    from preface.capture.rig import read_rig
+
+    rig = read_rig(report.path)
+    held_out = rig.held_out_reprojection_error
+    report.summary = {
+        "take": rig.take,
+        "cameras": [
+            {
+                "id": name,
+                "size": f"{entry.camera.width}x{entry.camera.height}",
+                "model": entry.camera.model,
+                "focal_length_px": float(entry.camera.intrinsics[0]),
+                "center_m": entry.camera_from_rig.inverse.translation.tolist(),
+                "reprojection_rms_px": entry.reprojection_error.rms if entry.reprojection_error else None,
+            }
+            for name, entry in rig.cameras.items()
+        ],
+        "held_out_reprojection_rms_px": held_out.rms if held_out else None,
+    }
+
+
+# ----------------------------------------------------------------------------------------- reports
+
+
+def _summarise_report(report: Report) -> None:
+    content = read_artifact(report.path, "preface/report")
+    report.summary = {
+        "title": content["title"],
+        "sections": [section["heading"] for section in content["sections"]],
+    }
+
+
+# ------------------------------------------------------------------------------------------ output
+
+
+def _as_json(reports: list[Report]) -> str:
+    artifacts = [
+        {
+            "path": str(report.path),
+            "schema": report.schema,
+            "ok": not report.problems,
+            "problems": [
+                {"file": str(p.path), "field": p.field, "problem": p.problem, "remedy": p.remedy}
+                for p in report.problems
+            ],
+            "summary": report.summary,
+        }
+        for report in reports
+    ]
+    return json.dumps({"ok": all(a["ok"] for a in artifacts), "artifacts": artifacts}, indent=2) + "\n"
+
+
+def _as_text(reports: list[Report]) -> str:
+    lines = []
+    for report in reports:
+        count = len(report.problems)
+        verdict = "valid" if not count else f"{count} problem{'s' if count > 1 else ''}"
+        lines.append(f"{report.path}: {report.schema or 'unknown kind'}: {verdict}")
+        lines += [f"  {key.replace('_', ' '):<30}{_cell(value)}" for key, value in report.summary.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(value: Any) -> str:
+    """One line for a name or number; for a list its length and then its entries."""
+    if value is None:
+        return "-"
+    if isinstance(value, dict):
+        return ", ".join(f"{key.replace('_', ' ')} {_cell(item)}" for key, item in value.items())
+    if not isinstance(value, list):
+        return f"{value:.6g}" if isinstance(value, float) else str(value)
+    if not value:
+        return "none"
+    if all(isinstance(item, float) for item in value):
+        return "(" + ", ".join(f"{item:.4f}" for item in value) + ")"
+    rest = f", ... and {len(value) - MAX_LISTED} more" if len(value) > MAX_LISTED else ""
+    if isinstance(value[0], dict):
+        return str(len(value)) + "".join(f"\n    {_cell(item)}" for item in value)
+    return f"{len(value)}: " + ", ".join(map(str, value[:MAX_LISTED])) + rest
+
+
+def _print(text: str) -> bool:
+    """Print to standard output; False, with the reason on standard error, when it takes no more."""
+    try:
+        sys.stdout.write(_printable(text, sys.stdout))
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        print(ArtifactError.from_os("standard output", "writing", error), file=sys.stderr)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return False
+    return True
+
+
+def _printable(text: str, stream: Any) -> str:
+    """Replace control codes, and characters that the stream's encoding lacks, by escapes."""
+    clean = "".join(c if c == "\n" or c.isprintable() else repr(c)[1:-1] for c in text)
+    encoding = stream.encoding or "utf-8"
+    return clean.encode(encoding, "backslashreplace").decode(encoding)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

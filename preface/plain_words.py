@@ -1,0 +1,101 @@
+"""What is wrong with a JSON value, in words for people who have never seen a JSON Schema."""
+
+import difflib
+import json
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any, cast
+
+if TYPE_CHECKING:
+    from jsonschema import ValidationError
+
+_JSON_TYPES = {
+    "object": "an object {...}",
+    "array": "a list [...]",
+    "string": "a text in quotes",
+    "number": "a number",
+    "integer": "a whole number",
+    "boolean": "true or false",
+    "null": "null",
+}
+_BOUNDS = {
+    "minimum": "at least",
+    "maximum": "at most",
+    "exclusiveMinimum": "more than",
+    "exclusiveMaximum": "less than",
+    "minItems": "at least",
+    "maxItems": "at most",
+}
+
+
+def in_plain_words(error: "ValidationError") -> tuple[str, str, str]:
+    """Translate a violation of a JSON Schema into (field, problem, remedy)."""
+    field, keyword = json_field(error.absolute_path), str(error.validator)
+    value, wanted = cast(Any, error.instance), cast(Any, error.validator_value)
+    schema: Any = error.schema if isinstance(error.schema, Mapping) else {}
+    description = str(schema.get("description", "")).rstrip(".")
+    remedy = f"It is: {description}" if description else "See data_specs for its meaning"
+    match keyword:
+        case "type":
+            kinds = [wanted] if isinstance(wanted, str) else wanted
+            needed = " or ".join(_JSON_TYPES[kind] for kind in kinds)
+            problem = f"is {shown(value)}, {json_type(value)}, but must be {needed}"
+        case "required" | "dependentRequired":
+            names = (
+                wanted
+                if keyword == "required"
+                else [n for key in wanted if key in value for n in wanted[key]]
+            )
+            missing = next(name for name in names if name not in value)
+            about = schema.get("properties", {}).get(missing, {}).get("description", "see data_specs")
+            field, problem, remedy = join_field(field, missing), "is missing", f"Add it ({about.rstrip('.')})"
+        case "additionalProperties":
+            extra = next(name for name in value if name not in schema["properties"])
+            field, problem = join_field(field, extra), "is not a known key"
+            remedy = f"{suggestion(extra, schema['properties'])} or remove it"
+        case "enum":
+            problem, remedy = f"{shown(value)} is not one of {', '.join(wanted)}", suggestion(value, wanted)
+        case "const":
+            problem = f"is {shown(value)}, but must be {shown(wanted)}"
+        case "minimum" | "exclusiveMinimum" | "maximum" | "exclusiveMaximum":
+            problem = f"is {shown(value)}, but must be {_BOUNDS[keyword]} {shown(wanted)}"
+        case "minItems" | "maxItems":
+            problem = f"has {len(value)} entries, but must have {_BOUNDS[keyword]} {wanted}"
+        case "pattern" | "minLength" | "maxLength":
+            problem = f"{shown(value)} is not allowed here"
+        case "not":  # {"not": {}}: the key has no meaning beside its neighbours
+            problem, remedy = "has no meaning here", "Remove it"
+        case _:
+            problem = error.message[:200]
+    return field, problem, remedy
+
+
+def json_field(parts: Iterable[str | int]) -> str:
+    """Spell the path of a JSON value: ``["subjects", 3, "take"]`` becomes ``subjects[3].take``."""
+    field = ""
+    for part in parts:
+        field = f"{field}[{part}]" if isinstance(part, int) else join_field(field, part)
+    return field or "file"
+
+
+def join_field(field: str, key: str) -> str:
+    """The path of ``key`` within the object at ``field``."""
+    return key if field in ("", "file") else f"{field}.{key}"
+
+
+def json_type(value: Any) -> str:
+    """The JSON type of a Python value, in plain words."""
+    kinds = {dict: "object", list: "array", str: "string", bool: "boolean", int: "integer", float: "number"}
+    return _JSON_TYPES[kinds.get(type(value), "null")]
+
+
+def shown(value: Any) -> str:
+    """A value as it stands in the file, shortened and on one line."""
+    text = f"'{value}'" if isinstance(value, str) else json.dumps(value, default=repr)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def suggestion(value: Any, choices: Iterable[str]) -> str:
+    """A remedy: the closest of ``choices``, or all of them."""
+    choices = list(choices)
+    close = difflib.get_close_matches(str(value), choices, n=1)
+    return f"Perhaps '{close[0]}' was meant" if close else f"Choose one of {', '.join(choices)}"
