@@ -87,9 +87,10 @@ def test_swapped_left_and_right_are_reported_with_both_residuals() -> None:
     assert fit_similarity(FACE, swapped).residuals.max() > 1e-3
 
 
-def test_noise_alone_does_not_look_mirrored() -> None:
+@pytest.mark.parametrize("points", [FACE, FACE * (1, 1, 0), FACE * (1, 1, 1e-3)])
+def test_noise_alone_does_not_look_mirrored(points: np.ndarray) -> None:
     rng = np.random.default_rng(0)
-    fits = [fit_similarity(FACE, FACE + rng.normal(size=FACE.shape) * 2e-3) for _ in range(200)]
+    fits = [fit_similarity(points, points + rng.normal(size=points.shape) * 2e-3) for _ in range(200)]
     assert not any(fit.mirrored for fit in fits)
 
 

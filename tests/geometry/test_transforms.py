@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from preface.geometry import (
     GeometryError,
@@ -69,6 +70,9 @@ def test_quaternions_are_scalar_first_with_positive_sign() -> None:
     )
     half_turn = quaternion_from_rotation(np.diag([-1.0, -1.0, 1.0]))
     np.testing.assert_allclose(half_turn, [0, 0, 0, 1], atol=1e-15)
+    angles = np.linspace(-3 * np.pi, 3 * np.pi, 500)
+    turns = Rotation.from_rotvec(angles[:, None] * np.array([0.6, 0.0, -0.8])).as_matrix()
+    assert (quaternion_from_rotation(turns)[:, 0] >= 0).all()
 
 
 def test_a_batch_of_transforms_moves_a_batch_of_points() -> None:
