@@ -30,7 +30,7 @@ from synthetic_studio.sensor import encode_srgb
 from synthetic_studio.template import head_template
 
 SEED = 990_001
-VIEWS = ((0.0, 0.0), (14.0, 4.0), (-14.0, 4.0), (0.0, -12.0), (0.0, 14.0))  # azimuth and elevation, degrees
+VIEWS = ((0.0, 0.0), (5.0, 3.0), (-5.0, 3.0), (4.0, -4.0), (-4.0, -4.0))  # azimuth and elevation, degrees
 CAMERA = Camera("PINHOLE", 512, 768, np.array([1800.0, 1800.0, 256.0, 384.0]))
 OUTPUT = Path(__file__).parent / "synthetic_studio" / "facemesh_on_template.json"
 

@@ -134,6 +134,10 @@ step "installing preface, editable" pip install --no-deps --no-build-isolation -
 say "checking that everything imports in one process"
 "$python" tools/check_environment.py || fail "the environment does not fit together; see above"
 
+# Minutes on the first start of a machine, a second afterwards; better here than in the middle of a test.
+step "reading the parametric head (slow the first time on a machine)" \
+    env PYTHONPATH=tools "$python" -c 'from synthetic_studio.template import head_template; head_template()'
+
 fingerprint >"$stamp.new"
 mv "$stamp.new" "$stamp"
 say "ready ($venv) after $SECONDS s"

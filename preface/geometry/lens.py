@@ -259,9 +259,7 @@ def monotonic_radius(intrinsics: np.ndarray) -> np.ndarray:
     sizes = [np.abs(k) ** (1 / (2 * i)) for i, k in ((1, k1), (2, k2), (3, k3), (1, k4), (2, k5), (3, k6))]
     unit = np.max([*sizes, tangential], axis=0)
     safe = np.where(unit > 0, unit, 1.0)
-    square = safe * safe  # divided by one at a time, as its cube may underflow
-    above = np.stack([np.ones_like(k1), k1 / square, k2 / square / square, k3 / square / square / square], -1)
-    below = np.stack([np.ones_like(k4), k4 / square, k5 / square / square, k6 / square / square / square], -1)
+    above, below = _in_units(safe, k1, k2, k3), _in_units(safe, k4, k5, k6)
     pull = np.stack([np.zeros_like(safe), tangential / safe], axis=-1)
 
     growth = _times(above * (1, 3, 5, 7), below) - _times(above, below * (0, 2, 4, 6))
@@ -271,6 +269,16 @@ def monotonic_radius(intrinsics: np.ndarray) -> np.ndarray:
         _in_radius(below),
     )
     return np.min([_first_positive_root(b) for b in boundaries], axis=0) / safe
+
+
+def _in_units(unit: np.ndarray, *coefficients: np.ndarray) -> np.ndarray:
+    """Return the polynomial 1 + c1 u + c2 u² + ... of u = r² [..., n + 1] for r in units of 1/unit."""
+    terms = [np.ones_like(unit)]
+    for i, coefficient in enumerate(coefficients, start=1):
+        for _ in range(2 * i):  # unit**6 might underflow
+            coefficient = coefficient / unit
+        terms.append(coefficient)
+    return np.stack(terms, axis=-1)
 
 
 def _in_radius(polynomial: np.ndarray) -> np.ndarray:

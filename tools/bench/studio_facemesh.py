@@ -60,8 +60,8 @@ def main() -> None:
         head = load_json(truth / "identities" / subject.id / "head.json")
         points = np.array([head["landmarks"].get(str(k), [np.nan] * 3) for k in range(478)])
         found[subject.id] = []
-        for camera_id, path in capture.images[subject.id].items():
-            seen = detect(read_image(path))
+        for camera_id in (camera.id for camera in capture.manifest.cameras):
+            seen = detect(read_image(capture.images[subject.id, camera_id]))
             if seen is None:
                 continue
             found[subject.id].append(camera_id)

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -35,7 +36,7 @@ def main() -> None:
     head_template()
     totals = np.zeros(3)
     for index in range(arguments.identities):
-        head, build = _timed(lambda index=index: build_head(0, index))  # type: ignore[misc]
+        head, build = _timed(lambda index=index: build_head(0, index))
         renderer = HeadRenderer(head)
         for view in cameras:
             view_of = (view.camera, view.camera_from_rig)
@@ -52,7 +53,10 @@ def main() -> None:
     print(f"per image with its share of the head, 13 views: {render + build / 13:.3f} CPU s")
 
 
-def _timed(work: Callable[[], object]) -> tuple[object, float]:
+Result = TypeVar("Result")
+
+
+def _timed(work: Callable[[], Result]) -> tuple[Result, float]:
     start = time.process_time()
     result = work()
     return result, time.process_time() - start

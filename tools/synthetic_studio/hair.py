@@ -11,7 +11,7 @@ import open3d as o3d
 from scipy.spatial import cKDTree
 
 from synthetic_studio.identity import HAIR_COLOURS, Identity
-from synthetic_studio.regions import SurfacePoints, eye_midpoint, scalp_mask, smoothstep
+from synthetic_studio.regions import SurfacePoints, coarse_ear_mask, eye_midpoint, scalp_mask, smoothstep
 from synthetic_studio.strands import Strands, resample, unit
 from synthetic_studio.template import HeadTemplate
 
@@ -153,21 +153,14 @@ def sample_scalp(
     corners = average[template.coarse_triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     density = scalp_mask(corners.mean(axis=1), hairline - 0.01)
-    density *= ~on_ear(corners.mean(axis=1))
     candidates = 3 * count
     triangle = rng.choice(len(area), size=candidates, p=area * (density > 0) / (area * (density > 0)).sum())
     weights = rng.dirichlet((1.0, 1.0, 1.0), size=candidates)
     points = SurfacePoints(triangle, weights)
     position = points.at(average, template.coarse_triangles)
-    kept = np.flatnonzero(rng.random(candidates) < scalp_mask(position, hairline) * ~on_ear(position))[:count]
+    ear = points.at(coarse_ear_mask()[:, None], template.coarse_triangles)[:, 0]
+    kept = np.flatnonzero(rng.random(candidates) < scalp_mask(position, hairline) * (ear < 0.5))[:count]
     return SurfacePoints(triangle[kept], weights[kept]), position[kept]
-
-
-def on_ear(position: np.ndarray) -> np.ndarray:
-    """Tell which points of the average head ``[P, 3]`` lie on an ear, which stands out beside the skull."""
-    x, y, z = position.T
-    skull = 0.0735 + 0.06 * np.maximum(-0.085 - z, 0.0)
-    return (np.abs(x) > skull) & (np.abs(y + 0.010) < 0.042) & (z > -0.130) & (z < -0.060)
 
 
 def _nearest_guides(root: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -215,7 +208,14 @@ def _grow_guides(
         direction = unit(pushed - guides[-1])
         point = guides[-1] + step * direction
         guides.append(point)
-    return np.stack(guides, axis=1), outward
+    return _relaxed(np.stack(guides, axis=1)), outward
+
+
+def _relaxed(guides: np.ndarray) -> np.ndarray:
+    """Take out the kinks that collisions leave, root kept: three rounds of averaging along each guide."""
+    for _ in range(3):
+        guides[:, 1:-1] = 0.25 * guides[:, :-2] + 0.5 * guides[:, 1:-1] + 0.25 * guides[:, 2:]
+    return guides
 
 
 def _closest(

@@ -184,6 +184,7 @@ def _eye_surface(ball: Eyeball, mesh: tuple[np.ndarray, np.ndarray], occluders: 
 
 
 def _lit_hair(hair: Strands, guides: Strands, occluders: Occluders) -> Strands:
+    guides = replace(guides, points=guides.points[:, ::2])  # light varies slowly along a strand
     light = bake_strands(guides.points.reshape(-1, 3), guides.tangents().reshape(-1, 3), occluders)
     return replace(hair, light=light_from_guides(hair, guides, light))
 

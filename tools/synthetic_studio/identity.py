@@ -21,7 +21,10 @@ UNUSED_CONTROLS = (
     "neck-trans-up",
     "head-angle-out",
 )
-CONTROL_SPREAD = 0.25  # standard deviation of anny's -1..1 face controls: varied, still plausible
+# Standard deviation of anny's -1..1 face controls: varied, still plausible. There are some twenty for the
+# nose, all of which move its tip, so each of them varies less.
+CONTROL_SPREAD = 0.22
+NOSE_SPREAD = 0.12
 ASYMMETRY_SPREAD = 0.04
 
 HAIR_STYLES = ("bald", "buzz", "short", "side_part", "slick_back", "bob", "long", "bun", "curly")
@@ -151,7 +154,8 @@ def _sample_controls(rng: np.random.Generator) -> dict[str, float]:
         elif label.startswith("r-"):
             controls[label] = controls["l-" + bare] + float(rng.normal(0.0, ASYMMETRY_SPREAD))
         else:
-            controls[label] = float(np.clip(rng.normal(0.0, CONTROL_SPREAD), -0.6, 0.6))
+            spread = NOSE_SPREAD if bare.startswith("nose") else CONTROL_SPREAD
+            controls[label] = float(np.clip(rng.normal(0.0, spread), -2.5 * spread, 2.5 * spread))
     return controls
 
 

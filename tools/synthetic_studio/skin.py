@@ -5,12 +5,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from synthetic_studio.hair import on_ear
 from synthetic_studio.identity import HAIR_COLOURS, Identity
 from synthetic_studio.regions import beard_mask, head_regions, scalp_mask, smoothstep
 from synthetic_studio.template import painted_mask
 
-TEXTURE_SIZE = 2048
+TEXTURE_SIZE = 1536
 # Linear sRGB albedo of skin from pale to dark, after the spread of measured diffuse reflectances.
 SKIN_MELANIN = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
 SKIN_ALBEDO = np.array(
@@ -65,7 +64,7 @@ def base_albedo(melanin: float) -> np.ndarray:
 def _hair_shadow(albedo: np.ndarray, identity: Identity, position: np.ndarray) -> np.ndarray:
     """Darken the skin under scalp hair and beard, where many thin hairs stand between the strands."""
     cover = {"bald": 0.10, "buzz": 0.75}.get(identity.hair_style, 0.92)
-    scalp = cover * scalp_mask(position, identity.hairline + 0.002) * ~on_ear(position)
+    scalp = cover * scalp_mask(position, identity.hairline + 0.002) * (1.0 - head_regions().ears)
     beard = 0.55 * min(identity.stubble, 1.0) * beard_mask(position)
     share = np.maximum(scalp, beard)[:, None]
     return (1.0 - share) * albedo + share * (
@@ -96,7 +95,7 @@ def _face_texture(identity: Identity, rng: np.random.Generator) -> tuple[np.ndar
     factor[..., 3] = (1.0 + 0.25 * pores * inside) * (1.0 + 0.7 * lips)
 
     age = identity.phenotypes["age"]
-    height = 1.3e-5 * pores + (2.2e-5 + 1.2e-4 * max(0.0, age - 0.75)) * _band_noise(rng, 0.0013)
+    height = 7e-6 * pores + (1.2e-5 + 1.2e-4 * max(0.0, age - 0.75)) * _band_noise(rng, 0.0013)
     height = (height + 3e-5 * lips * (creases - 1.0) * 10.0) * inside
     relief = np.stack([np.gradient(height, axis=1), np.gradient(height, axis=0)], axis=-1) / METRES_PER_TEXEL
     return np.clip(factor, 0.1, 2.0), relief.astype(np.float32)

