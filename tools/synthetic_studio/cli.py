@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import tyro
 
 from preface.artifacts import ArtifactError
+from synthetic_studio.assets import check_assets
 from synthetic_studio.config import StudioConfig, StudioError, UsageError, validate
 from synthetic_studio.estimate import estimate
 from synthetic_studio.writer import write_studio
@@ -22,6 +23,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if config.dry_run:
             validate(config)
+            if config.assets is not None:
+                check_assets(config.assets)
             print(describe(config))
         else:
             print(write_studio(config))

@@ -142,7 +142,7 @@ NOT_CONTENT = ("output", "jobs", "dry_run", "assets")
 def content(config: StudioConfig) -> dict[str, Any]:
     """The part of the configuration that the files depend on, as plain JSON values."""
     chosen = {name: value for name, value in asdict(config).items() if name not in NOT_CONTENT}
-    return _plain(chosen)
+    return _plain(chosen | {"assets": config.assets is not None})  # whether, not where they lie on this disk
 
 
 def parse_resolution(text: str) -> tuple[int, int]:

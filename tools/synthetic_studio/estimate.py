@@ -17,12 +17,12 @@ BOARD_BYTES = 1.5
 PHOTOGRAPH_BYTES = {"black": 1.2, "green": 1.5}
 PLATE_BYTES = {"black": 0.55, "green": 1.05}
 TRUTH_BYTES = 4.2  # mask, depth and normals
-HEAD_BYTES = 8000  # parameters, keypoints and landmarks
+HEAD_BYTES = 52_000  # parameters, keypoints and landmarks
 
 # Seconds on one core.
 START = 7.0  # a worker's imports and the parametric model
-HEAD = 10.0  # modelling one person
-SAMPLE = 3.5e-6  # one ray of a photograph, shading included
+HEAD = 6.0  # modelling one person
+SAMPLE = 2.3e-6  # one ray of a photograph, shading included
 PIXEL = 0.8e-6  # sensor, encoding and truth of a photograph
 BOARD_PIXEL = 0.8e-6  # a calibration image in all
 

@@ -50,13 +50,16 @@ def grow_eyebrows(
     reach = length[:, None, None] * t
     lift = 0.0004 + 0.30 * reach * (1.0 - 0.75 * t)
     points = root[:, None] + reach * tangent[:, None] + lift * normal[:, None]
-    dark = 0.35 if identity.hair_colour in ("blond", "auburn", "grey", "white") else 0.8
-    colour = (
-        dark * np.array(HAIR_COLOURS[identity.hair_colour]) * np.exp(rng.normal(0.0, 0.2, (2 * count, 1)))
-    )
+    colour = brow_colour(identity) * np.exp(rng.normal(0.0, 0.2, (2 * count, 1)))
     return Strands(
         points, normal, rng.uniform(0.00022, 0.00036, 2 * count), colour, np.ones(points.shape[:2])
     )
+
+
+def brow_colour(identity: Identity) -> np.ndarray:
+    """Return the linear RGB ``[3]`` of the eyebrows, which are darker than the hair."""
+    dark = 0.35 if identity.hair_colour in ("blond", "auburn", "grey", "white") else 0.8
+    return dark * np.array(HAIR_COLOURS[identity.hair_colour])
 
 
 def grow_eyelashes(

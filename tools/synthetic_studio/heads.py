@@ -1,6 +1,7 @@
 """One identity as geometry and appearance, built once and then seen by every camera."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,8 @@ import open3d as o3d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from synthetic_studio.cards import Cards
+from synthetic_studio.dressing import dress
 from synthetic_studio.eyes import Eyeball, EyeColour, eye_colour, eyeball_mesh
 from synthetic_studio.facial_hair import grow_beard, grow_eyebrows, grow_eyelashes
 from synthetic_studio.hair import grow_hair, light_from_guides, shadow_casters
@@ -56,6 +59,7 @@ class Head:
         eye_colour: Pattern of the irises.
         strands: Scalp hair, brows, lashes and beard.
         ribbon_triangles: ``[T, 3]`` of the strands' ribbons.
+        cards: Hair and brows of the user's own assets, which the scene does not have.
         scene: The ray caster; geometry ids 0 skin, 1 and 2 eyes, 3 strands.
     """
 
@@ -69,6 +73,7 @@ class Head:
     eye_colour: EyeColour
     strands: Strands
     ribbon_triangles: np.ndarray
+    cards: tuple[Cards, ...]
     scene: o3d.t.geometry.RaycastingScene
 
 
@@ -82,25 +87,29 @@ def build_head(seed: int, index: int, assets: Path | None = None) -> Head:
     """
     template = head_template()
     identity = sample_identity(seed, index)
-    vertices = template.vertices(identity.phenotypes, identity.controls, identity.actions)
-    vertices = _seat(vertices, identity, template)
+    body = template.body(identity.phenotypes, identity.controls, identity.actions)
+    seat = partial(_seat, upright=body[template.kept], identity=identity, template=template)
+    vertices = seat(body[template.kept])
+    dressing = dress(assets, identity, seed, body, seat)
     coarse = vertices[: template.skin_vertex_count]
     coarse_normals = vertex_normals(coarse, template.coarse_triangles)
     eye_midpoint = np.mean([template.eyeball(vertices, side)[0] for side in ("left", "right")], axis=0)
 
     rng = generator(seed, Stream.HAIR, index)
-    grown = grow_hair(identity, template, coarse, eye_midpoint, rng)
+    grown = None if dressing.hair else grow_hair(identity, template, coarse, eye_midpoint, rng)
     facial = [
-        grow_eyebrows(identity, template, coarse, coarse_normals, rng),
+        *([] if dressing.eyebrows else [grow_eyebrows(identity, template, coarse, coarse_normals, rng)]),
         grow_eyelashes(identity, template, vertices, rng),
         *grow_beard(identity, template, coarse, coarse_normals, rng),
     ]
     fine = _shirt(template.refine(coarse), template)
     eyeballs = {side: _eyeball(template, vertices, side) for side in ("right", "left")}
     eye_meshes = {side: eyeball_mesh(ball) for side, ball in eyeballs.items()}
+    casters = [ribbons(shadow_casters(grown[0]))] if grown else []
+    casters += [dressing.hair.shadow()] if dressing.hair else []
     occluders = Occluders(
         _scene([(coarse, template.coarse_triangles), *eye_meshes.values()]),
-        _scene([ribbons(shadow_casters(grown[0]))]) if grown else None,
+        _scene(casters) if casters else None,
     )
     surface = _skin_surface(template, coarse, fine, occluders)
     short = [_lit_from_skin(part, surface) for part in facial]
@@ -109,27 +118,28 @@ def build_head(seed: int, index: int, assets: Path | None = None) -> Head:
     points = facemesh_landmarks(fine, template, eyeballs)
     ribbon_vertices, ribbon_triangles = ribbons(strands)
     return Head(
-        parameters=identity.to_json(),
+        parameters=identity.to_json() | dressing.to_json(),
         keypoints=keypoints(points),
         landmarks=points,
         surface=surface,
-        skin=make_skin(identity, generator(seed, Stream.SKIN, index)),
+        skin=dressing.skin(make_skin(identity, generator(seed, Stream.SKIN, index))),
         eyeballs=eyeballs,
         eye_surfaces={
             side: _eye_surface(eyeballs[side], mesh, occluders) for side, mesh in eye_meshes.items()
         },
-        eye_colour=eye_colour(identity, generator(seed, Stream.EYES, index)),
+        eye_colour=dressing.eye_colour(eye_colour(identity, generator(seed, Stream.EYES, index))),
         strands=strands,
         ribbon_triangles=ribbon_triangles,
+        cards=dressing.cards(surface, occluders),
         scene=_scene([(fine, template.triangles), *eye_meshes.values(), (ribbon_vertices, ribbon_triangles)]),
     )
 
 
-def _seat(vertices: np.ndarray, identity: Identity, template: HeadTemplate) -> np.ndarray:
-    """Move the head to where this subject holds it."""
-    eyes = 0.5 * (template.eyeball(vertices, "left")[0] + template.eyeball(vertices, "right")[0])
+def _seat(points: np.ndarray, upright: np.ndarray, identity: Identity, template: HeadTemplate) -> np.ndarray:
+    """Move points ``[V, 3]`` of the head to where this subject holds it; ``upright`` are its kept vertices before."""
+    eyes = 0.5 * (template.eyeball(upright, "left")[0] + template.eyeball(upright, "right")[0])
     turn = Rotation.from_euler("YXZ", [identity.yaw, identity.pitch, identity.roll])
-    return turn.apply(vertices - (eyes + HEAD_CENTRE_FROM_EYES)) + np.array(identity.offset)
+    return turn.apply(points - (eyes + HEAD_CENTRE_FROM_EYES)) + np.array(identity.offset)
 
 
 def _shirt(fine: np.ndarray, template: HeadTemplate) -> np.ndarray:

@@ -24,7 +24,7 @@ UNUSED_CONTROLS = (
 # Standard deviation of anny's -1..1 face controls: varied, still plausible. There are some twenty for the
 # nose, all of which move its tip, so each of them varies less.
 CONTROL_SPREAD = 0.22
-NOSE_SPREAD = 0.12
+NOSE_SPREAD = 0.08
 ASYMMETRY_SPREAD = 0.04
 
 HAIR_STYLES = ("bald", "buzz", "short", "side_part", "slick_back", "bob", "long", "bun", "curly")

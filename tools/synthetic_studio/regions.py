@@ -140,10 +140,13 @@ def _ellipse(
 
 @cache
 def coarse_ear_mask() -> np.ndarray:
-    """Return 1 on the ears and 0 elsewhere, per vertex of the coarse skin: what anny's ear controls move."""
+    """Return 1 on the ears and 0 elsewhere, per vertex of the coarse skin.
+
+    The ears are what anny's control moves that makes them stand out; its other ear controls move the temples too.
+    """
     template = head_template()
     moved = np.zeros(len(template.kept))
     for side in ("l", "r"):
-        changed = template.vertices({}, {f"{side}-ear-scale-incr": 1.0}, {}) - template.vertices({}, {}, {})
+        changed = template.vertices({}, {f"{side}-ear-wing-incr": 1.0}, {}) - template.vertices({}, {}, {})
         moved = np.maximum(moved, np.linalg.norm(changed, axis=1))
-    return smoothstep(0.002, 0.006, moved[: template.skin_vertex_count])
+    return smoothstep(0.0003, 0.001, moved[: template.skin_vertex_count])

@@ -6,6 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 from preface.geometry import Camera, Rigid
+from synthetic_studio.cards import CardLayers
 from synthetic_studio.heads import Head
 from synthetic_studio.shading import SkinShader, StrandShader, shade_eyes
 from synthetic_studio.strands import unit
@@ -41,6 +42,7 @@ class HeadRenderer:
         self._head = head
         self._skin = SkinShader(head, head_template().corner_uvs)
         self._strands = StrandShader(head)
+        self._cards = CardLayers(head.cards) if head.cards else None
 
     def render(self, camera: Camera, camera_from_studio: Rigid, antialias: int) -> HeadRender:
         """Render one view with ``antialias`` x ``antialias`` samples per pixel."""
@@ -66,13 +68,14 @@ class HeadRenderer:
         uv = hits["primitive_uvs"].numpy()
         view = -rays[:, 3:]
         view /= np.linalg.norm(view, axis=1, keepdims=True)
-        focal_length = float(np.mean(camera.intrinsics[:2]))
-        footprint = SUBJECT_DISTANCE / (focal_length * antialias)
+        footprint = _footprint(camera, antialias)
         radiance = np.zeros((len(rays), 3), np.float32)
         for part in np.unique(geometry[geometry <= STRANDS]):
             at = np.flatnonzero(geometry == part)
             radiance[at] = self._shade(int(part), primitive[at], uv[at], view[at], footprint)
         covered = (geometry <= STRANDS).astype(np.float32)
+        if self._cards:
+            radiance, covered = self._cards.over(rays, hits["t_hit"].numpy(), radiance, covered, footprint)
         shape = (bottom - top, antialias, camera.width, antialias)
         return radiance.reshape(*shape, 3).mean(axis=(1, 3)), covered.reshape(shape).mean(axis=(1, 3))
 
@@ -103,6 +106,8 @@ class HeadRenderer:
             at = np.flatnonzero(geometry == part)
             points = rays[at, :3] + depth[at, None] * rays[at, 3:]
             normals[at] = unit(points - self._head.eyeballs[side].centre)
+        if self._cards:
+            depth, normals = self._cards.first_surface(rays, depth, normals, _footprint(camera, 1))
         shape = (bottom - top, camera.width)
         return depth.reshape(shape), normals.reshape(*shape, 3)
 
@@ -119,6 +124,12 @@ def _camera_directions(camera: Camera, top: int, bottom: int, antialias: int) ->
             f"{(~valid).sum()} pixels lie past the monotonic radius of the lens; weaken its distortion"
         )
     return np.concatenate([xy, np.ones((len(xy), 1))], axis=1).astype(np.float32)
+
+
+def _footprint(camera: Camera, antialias: int) -> float:
+    """Return the width of a sample on the subject, in metres."""
+    focal_length = float(np.mean(camera.intrinsics[:2]))
+    return SUBJECT_DISTANCE / (focal_length * antialias)
 
 
 def pixel_rays(

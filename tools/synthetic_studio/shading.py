@@ -10,8 +10,10 @@ from synthetic_studio.eyes import shade_eye
 from synthetic_studio.heads import Head, Surface
 from synthetic_studio.lighting import FILL_DIRECTION, KEY_DIRECTION, studio_lights
 from synthetic_studio.regions import head_regions
-from synthetic_studio.skin import METRES_PER_TEXEL
+from synthetic_studio.skin import METRES_PER_TEXEL, TEXTURE_SIZE
 from synthetic_studio.strands import unit
+from synthetic_studio.template import full_uvs
+from synthetic_studio.textures import pyramid, sample
 
 SKIN_F0 = 0.028  # reflectance at normal incidence for an index of refraction of 1.4
 SKIN_ROUGHNESS = 0.40
@@ -19,6 +21,7 @@ EYE_F0 = 0.025
 SURROUND_RADIANCE = 0.62
 KEY_PANEL_RADIANCE = 5.0  # what a mirror would show of the softbox
 KEY_PANEL_TANGENT = 0.36
+METRES_PER_UV = METRES_PER_TEXEL * TEXTURE_SIZE / 0.25  # about, on the face in hm08's texture layout
 
 
 def interpolate(values: np.ndarray, corners: np.ndarray, uv: np.ndarray) -> np.ndarray:
@@ -42,6 +45,7 @@ class SkinShader:
         self._pyramid = [(skin.detail, skin.relief)]
         while len(self._pyramid) < 7:
             self._pyramid.append(tuple(cv2.pyrDown(level) for level in self._pyramid[-1]))
+        self._painted = [] if skin.painted is None else pyramid(skin.painted)
 
     def normals(self, primitive: np.ndarray, uv: np.ndarray) -> np.ndarray:
         """Return smooth geometric normals ``[P, 3]`` at hits."""
@@ -67,6 +71,8 @@ class SkinShader:
         albedo, irradiance = packed[:, 3:6], packed[:, 6:9]
         gloss, key_visibility, openness = packed[:, 9], packed[:, 10], packed[:, 11]
         cloth = np.clip(0.5 - packed[:, 15] / max(footprint, 5e-4), 0.0, 1.0)[:, None]
+        if self._painted:
+            albedo = albedo * self._painted_albedo(primitive, uv, footprint)
         detail, relief = self._texture(primitive, uv, footprint)
         tangent, bitangent = self._tangents[0][primitive], self._tangents[1][primitive]
         bumped = unit(normal - relief[:, :1] * tangent - relief[:, 1:] * bitangent)
@@ -87,15 +93,24 @@ class SkinShader:
     ) -> tuple[np.ndarray, np.ndarray]:
         level = int(np.clip(np.log2(max(footprint / METRES_PER_TEXEL, 1.0)), 0, len(self._pyramid) - 1))
         detail, relief = self._pyramid[level]
-        corner = self._corner_uvs[primitive]
-        u, v = uv[:, :1], uv[:, 1:]
-        place = (1.0 - u - v) * corner[:, 0] + u * corner[:, 1] + v * corner[:, 2]
-        place = place * detail.shape[0] - 0.5
+        place = self._place(primitive, uv) * detail.shape[0] - 0.5
         sampled, slopes = (
             _remap(texture, place, fill)
             for texture, fill in ((detail, (1.0, 1.0, 1.0, 1.0)), (relief, (0.0, 0.0)))
         )
         return sampled, slopes
+
+    def _painted_albedo(self, primitive: np.ndarray, uv: np.ndarray, footprint: float) -> np.ndarray:
+        texel = METRES_PER_UV / self._painted[0].shape[0]
+        level = int(np.clip(np.log2(max(footprint / texel, 1.0)), 0, len(self._painted) - 1))
+        place = full_uvs(self._place(primitive, uv))
+        return np.maximum(sample(self._painted[level], place, cv2.INTER_CUBIC), 0.0)
+
+    def _place(self, primitive: np.ndarray, uv: np.ndarray) -> np.ndarray:
+        """Return column and row ``[P, 2]`` in the face's texture, 0..1 inside it."""
+        corner = self._corner_uvs[primitive]
+        u, v = uv[:, :1], uv[:, 1:]
+        return (1.0 - u - v) * corner[:, 0] + u * corner[:, 1] + v * corner[:, 2]
 
 
 def shade_eyes(head: Head, side: str, primitive: np.ndarray, uv: np.ndarray, view: np.ndarray) -> np.ndarray:

@@ -29,6 +29,7 @@ class Skin:
         detail: ``[T, T, 4]`` float32 over the face's texture: RGB factor on the albedo, and factor on the gloss.
         relief: ``[T, T, 2]`` float32 slope of the surface along the texture's columns and rows.
         shirt: ``[V, 3]`` linear RGB of the cloth per fine vertex, where the shirt covers the skin.
+        painted: ``[H, W, 3]`` float32 linear RGB in hm08's texture layout, on which ``albedo`` is then a factor.
     """
 
     albedo: np.ndarray
@@ -36,6 +37,7 @@ class Skin:
     detail: np.ndarray
     relief: np.ndarray
     shirt: np.ndarray
+    painted: np.ndarray | None = None
 
 
 def make_skin(identity: Identity, rng: np.random.Generator) -> Skin:
@@ -47,8 +49,12 @@ def make_skin(identity: Identity, rng: np.random.Generator) -> Skin:
     blood = identity.redness * pale * (0.9 * regions.cheeks + 0.9 * regions.nose + 0.8 * regions.ears)
     albedo *= 1.0 + blood[:, None] * BLOOD + 0.05 * _solid_noise(regions.position, 0.018, rng)[:, None]
     albedo *= 1.0 - (0.16 * regions.eye_sockets)[:, None] * np.array([0.8, 1.0, 0.7])
-    albedo = _hair_shadow(albedo, identity, regions.position)
+    hair = _hair_cover(identity, regions.position)
+    albedo = (1.0 - hair) * albedo + hair * (
+        0.6 * np.array(HAIR_COLOURS[identity.hair_colour]) + 0.12 * albedo
+    )
     gloss = 1.0 + 0.5 * regions.nose + 0.45 * regions.forehead + 0.25 * regions.cheeks
+    gloss *= 1.0 - 0.85 * hair[:, 0]
     detail, relief = _face_texture(identity, rng)
     weave = 1.0 + 0.08 * _solid_noise(regions.position, 0.006, rng)
     return Skin(
@@ -61,15 +67,12 @@ def base_albedo(melanin: float) -> np.ndarray:
     return np.array([np.interp(melanin, SKIN_MELANIN, SKIN_ALBEDO[:, c]) for c in range(3)])
 
 
-def _hair_shadow(albedo: np.ndarray, identity: Identity, position: np.ndarray) -> np.ndarray:
-    """Darken the skin under scalp hair and beard, where many thin hairs stand between the strands."""
-    cover = {"bald": 0.10, "buzz": 0.75}.get(identity.hair_style, 0.92)
+def _hair_cover(identity: Identity, position: np.ndarray) -> np.ndarray:
+    """Return how much of the skin ``[V, 1]`` thin hairs cover, between the strands of scalp hair and beard."""
+    cover = {"bald": 0.10, "buzz": 0.88}.get(identity.hair_style, 0.92)
     scalp = cover * scalp_mask(position, identity.hairline + 0.002) * (1.0 - head_regions().ears)
     beard = 0.55 * min(identity.stubble, 1.0) * beard_mask(position)
-    share = np.maximum(scalp, beard)[:, None]
-    return (1.0 - share) * albedo + share * (
-        0.6 * np.array(HAIR_COLOURS[identity.hair_colour]) + 0.12 * albedo
-    )
+    return np.maximum(scalp, beard)[:, None]
 
 
 def _face_texture(identity: Identity, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -27,6 +27,7 @@ class Stream(IntEnum):
     HAIR = 11
     SKIN = 12
     EYES = 13
+    ASSETS = 14
 
 
 def generator(seed: int, stream: Stream, *entities: int) -> np.random.Generator:

@@ -62,7 +62,13 @@ class HeadTemplate:
         self, phenotypes: dict[str, float], controls: dict[str, float], actions: dict[str, float]
     ) -> np.ndarray:
         """Return the kept vertices ``[N, 3]`` of one identity, in the studio's axes."""
-        return _rest_vertices(self.model, phenotypes, controls, actions)[self.kept]
+        return self.body(phenotypes, controls, actions)[self.kept]
+
+    def body(
+        self, phenotypes: dict[str, float], controls: dict[str, float], actions: dict[str, float]
+    ) -> np.ndarray:
+        """Return all hm08 vertices ``[19158, 3]`` of one identity, helpers included, in the studio's axes."""
+        return _rest_vertices(self.model, phenotypes, controls, actions)
 
     def refine(self, skin: np.ndarray) -> np.ndarray:
         """Subdivide per-vertex values ``[skin_vertex_count, C]`` of the coarse skin to the finest level."""
@@ -75,11 +81,7 @@ class HeadTemplate:
     def eyeball(self, vertices: np.ndarray, side: str) -> tuple[np.ndarray, float]:
         """Return centre and radius of the sphere that best fits one eye's helper vertices."""
         first, last = EYE_RANGES[side]
-        points = vertices[self.index(first) : self.index(last - 1) + 1]
-        design = np.c_[2.0 * points, np.ones(len(points))]
-        solution = np.linalg.lstsq(design, (points**2).sum(axis=1), rcond=None)[0]
-        centre = solution[:3]
-        return centre, float(np.sqrt(solution[3] + centre @ centre))
+        return fit_sphere(vertices[self.index(first) : self.index(last - 1) + 1])
 
 
 @cache
@@ -141,6 +143,21 @@ def painted_mask(name: str, size: tuple[int, int]) -> np.ndarray:
         round((1 - top) * height) : round((1 - bottom) * height), round(left * width) : round(right * width)
     ]
     return cv2.resize(crop.astype(np.float32) / 255.0, size, interpolation=cv2.INTER_CUBIC).clip(0.0, 1.0)
+
+
+def full_uvs(places: np.ndarray) -> np.ndarray:
+    """Return columns and rows ``[..., 2]`` in hm08's whole texture (0..1) of places in the cropped one."""
+    left, bottom, right, top = UV_CROP
+    size = np.array([right - left, top - bottom], np.float32)
+    return places * size + np.array([left, 1.0 - top], np.float32)
+
+
+def fit_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return centre ``[3]`` and radius of the sphere that best fits points ``[P, 3]``, by linear least squares."""
+    design = np.c_[2.0 * points, np.ones(len(points))]
+    solution = np.linalg.lstsq(design, (points**2).sum(axis=1), rcond=None)[0]
+    centre = solution[:3]
+    return centre, float(np.sqrt(solution[3] + centre @ centre))
 
 
 AVERAGE_ADULT = {"age": 0.7, "gender": 0.5, "african": 0.33, "asian": 0.33, "caucasian": 0.34}

