@@ -31,7 +31,7 @@ from synthetic_studio.template import head_template
 
 SEED = 990_001
 VIEWS = ((0.0, 0.0), (5.0, 3.0), (-5.0, 3.0), (4.0, -4.0), (-4.0, -4.0))  # azimuth and elevation, degrees
-CAMERA = Camera("PINHOLE", 512, 768, np.array([1800.0, 1800.0, 256.0, 384.0]))
+CAMERA = Camera("PINHOLE", 256, 384, np.array([900.0, 900.0, 128.0, 192.0]))
 OUTPUT = Path(__file__).parent / "synthetic_studio" / "facemesh_on_template.json"
 
 
@@ -64,7 +64,7 @@ def _positions_on_average(index: int) -> np.ndarray:
     for azimuth, elevation in VIEWS:
         pose = look_at(azimuth, elevation)
         image = np.round(
-            255.0 * encode_srgb(np.clip(renderer.render(CAMERA, pose, antialias=1).radiance, 0.0, 1.0))
+            255.0 * encode_srgb(np.clip(renderer.render(CAMERA, pose, antialias=2).radiance, 0.0, 1.0))
         ).astype(np.uint8)
         pixels = detect(image)
         rows.append(np.full((468, 3), np.nan) if pixels is None else _cast_back(head, pose, pixels[:468]))
