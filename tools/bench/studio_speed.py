@@ -9,6 +9,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -36,7 +37,7 @@ def main() -> None:
     head_template()
     totals = np.zeros(3)
     for index in range(arguments.identities):
-        head, build = _timed(lambda index=index: build_head(0, index))
+        head, build = _timed(partial(build_head, 0, index))
         renderer = HeadRenderer(head)
         for view in cameras:
             view_of = (view.camera, view.camera_from_rig)
