@@ -74,7 +74,7 @@ def _artifacts(path: Path) -> list[Report]:
     """Empty reports for the artefacts at a path; in a folder, their names say their schemas."""
     if not path.is_dir():
         return [Report(path)]
-    found = [Report(path / f"{kind}.json", f"preface/{kind}") for kind in ("capture", "rig")]
+    found = [Report(path / f"{kind}.json", f"preface/{kind}") for kind in ("capture", "corners", "rig")]
     found = [report for report in found if os.path.lexists(report.path)]
     if (path / "subjects").is_dir() and not os.path.lexists(path / "capture.json"):
         found.insert(0, Report(path, "preface/capture"))  # its manifest is inferred
@@ -87,6 +87,7 @@ def _artifacts(path: Path) -> list[Report]:
 def _inspect_artifact(report: Report) -> Report:
     summarise: Mapping[str, Callable[[Report], None]] = {
         "preface/capture": _summarise_capture,
+        "preface/corners": _summarise_corners,
         "preface/rig": _summarise_rig,
         "preface/report": _summarise_report,
     }
@@ -186,6 +187,34 @@ def _summarise_rig(report: Report) -> None:
             for name, entry in rig.cameras.items()
         ],
         "held_out_reprojection_rms_px": held_out.rms if held_out else None,
+    }
+
+
+# ----------------------------------------------------------------------------------------- corners
+
+
+def _summarise_corners(report: Report) -> None:
+    from preface.capture.boards import board_in_words
+    from preface.capture.corners import read_corners
+
+    corners = read_corners(report.path)
+    seen = corners.observations
+    report.summary = {
+        "take": corners.take,
+        "board": board_in_words(corners.board) if corners.board else None,
+        "board_points": len(seen.board_points),
+        "frames": len(seen.frame_ids),
+        "corners": len(seen),
+        "cameras": [
+            {
+                "id": name,
+                "size": f"{size[0]}x{size[1]}",
+                "frames": int((row > 0).sum()),
+                "corners": int(row.sum()),
+            }
+            for name, size, row in zip(seen.camera_ids, seen.image_sizes, seen.counts, strict=True)
+        ],
+        "warnings": list(corners.warnings),
     }
 
 
