@@ -1,0 +1,250 @@
+"""From sightings of a board to a rig with its uncertainty: the one entry to the calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from preface.capture.calibration.adjustment import Adjusted, adjust_robustly, least_squares
+from preface.capture.calibration.colmap_backend import adjust_with_colmap
+from preface.capture.calibration.covariance import Uncertainty, uncertainty
+from preface.capture.calibration.determined import require_determined, require_fit, require_unfolded
+from preface.capture.calibration.errors import CalibrationError
+from preface.capture.calibration.initial import Alone, calibrate_alone, sigma_alone
+from preface.capture.calibration.selection import Candidate, held_out, select_model
+from preface.capture.calibration.spanning_tree import assemble
+from preface.capture.calibration.state import free_head
+from preface.capture.calibration.views import BoardViews, stack_views
+from preface.capture.observations import Observations
+from preface.capture.rig import Coverage, HeldOutError, ReprojectionError, Rig, RigCamera, StandardDeviations
+from preface.geometry.cameras import CAMERA_MODELS, Camera
+from preface.geometry.transforms import Rigid
+
+CameraModel = Literal["auto", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"]
+# What the inliers are found with before a model is chosen: flexible enough for ordinary lenses.
+FLEXIBLE_MODEL = "OPENCV"
+# A rig's errors beyond this multiple of its cameras' own come from the rig: time, or motion.
+UNSYNCHRONISED = 2.0
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """How to calibrate.
+
+    Attributes:
+        camera_model: a COLMAP model, or "auto": the simplest that held-out frames support.
+        board_warp: whether the board may bow, by two parameters; "auto" leaves it to held-out frames.
+        folds: parts that frames are divided into to hold one out at a time.
+        backend: "own" Levenberg-Marquardt, or "pycolmap", which keeps the board's shape as ours found it.
+    """
+
+    camera_model: CameraModel = "auto"
+    board_warp: Literal["auto", "on", "off"] = "auto"
+    folds: int = 5
+    backend: Literal["own", "pycolmap"] = "own"
+
+    def __post_init__(self) -> None:
+        if self.camera_model != "auto" and self.camera_model not in CAMERA_MODELS:
+            raise CalibrationError(
+                f"camera_model: '{self.camera_model}' is unknown; use auto or one of {', '.join(CAMERA_MODELS)}"
+            )
+        if self.folds < 2:
+            raise CalibrationError(f"folds: {self.folds} is less than 2; 5 is usual")
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A calibrated rig, and how it was found.
+
+    Attributes:
+        observations: the sightings.
+        cameras: C lenses, in the order of `observations.camera_ids`.
+        camera_from_rig: C poses; the rig's frame is the first camera's.
+        rig_from_board: pose of the board by frame id; frames that nothing sure was seen in are absent.
+        board_warp: [2] metres, the bow of the board's middle along x and along y; zero for a flat board.
+        inliers: [M], the sightings that the rig was fitted to.
+        residuals: [M, 2] pixels, projected minus measured, also of outliers; NaN in frames that are absent.
+        uncertainty: covariances, first camera as datum; `uncertainty.under("boards")` is free of the gauge.
+        held_out: error over frames that were held out in turn; None if there were too few.
+        selection: the candidates among which models were chosen, simplest first; empty without a choice.
+        sigma_alone: noise per coordinate, pixels, when every view has a board pose of its own: what the
+            corners are worth. `uncertainty.sigma` is much larger if cameras are not simultaneous.
+    """
+
+    observations: Observations
+    cameras: tuple[Camera, ...]
+    camera_from_rig: Rigid
+    rig_from_board: Mapping[str, Rigid]
+    board_warp: np.ndarray
+    inliers: np.ndarray
+    residuals: np.ndarray
+    uncertainty: Uncertainty
+    held_out: HeldOutError | None
+    selection: tuple[Candidate, ...]
+    sigma_alone: float
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a user should know although the calibration went through."""
+        ratio = self.uncertainty.sigma / self.sigma_alone
+        if ratio < UNSYNCHRONISED:
+            return ()
+        return (
+            f"errors are {ratio:.1f} times larger in the rig ({self.uncertainty.sigma:.2f} px) than in each camera "
+            f"alone ({self.sigma_alone:.2f} px): the cameras do not take a frame at the same instant, or something "
+            "moved. Standard deviations are then too small; hold the board still in each frame",
+        )
+
+    @property
+    def reprojection_rms(self) -> float:
+        """Over the inliers, pixels."""
+        return float(np.sqrt((self.residuals[self.inliers] ** 2).sum(axis=-1).mean()))
+
+    def point_covariance(self, points: np.ndarray, pixel_noise: float) -> np.ndarray:
+        """Predict the covariance [N, 3, 3] of triangulated points [N, 3] (rig frame), calibration and noise.
+
+        The calibration's part holds under the datum "boards". Cameras whose image shows a point see it.
+        """
+        visible = np.zeros((len(points), len(self.cameras)), bool)
+        for index, camera in enumerate(self.cameras):
+            pose = Rigid(self.camera_from_rig.rotation[index], self.camera_from_rig.translation[index])
+            pixels, valid = camera.project(pose.apply(points))
+            size = (camera.width, camera.height)
+            visible[:, index] = valid & ((pixels >= 0) & (pixels <= size)).all(axis=-1)
+        of_calibration, of_noise = self.uncertainty.under("boards").points(points, visible, pixel_noise)
+        return of_calibration + of_noise
+
+    def rig(self, take: str) -> Rig:
+        """Return the artefact `rig.json` holds."""
+        params, rotation, translation = self.uncertainty.standard_deviations
+        cameras = {}
+        for index, name in enumerate(self.observations.camera_ids):
+            pose = Rigid(self.camera_from_rig.rotation[index], self.camera_from_rig.translation[index])
+            cameras[name] = RigCamera.at(
+                self.cameras[index],
+                pose,
+                reprojection_error=self._reprojection_error(index),
+                standard_deviations=StandardDeviations(
+                    tuple(params[index].tolist()),
+                    tuple(rotation[index].tolist()),
+                    tuple(translation[index].tolist()),
+                ),
+                covariance=tuple(tuple(row) for row in self.uncertainty.camera(index).tolist()),
+                coverage=self._coverage(index),
+            )
+        return Rig(take, cameras, self.held_out)
+
+    def _reprojection_error(self, camera: int) -> ReprojectionError:
+        mine = self.inliers & (self.observations.camera == camera)
+        length = np.linalg.norm(self.residuals[mine], axis=-1)
+        return ReprojectionError(
+            float(np.sqrt((length**2).mean())), float(np.median(length)), int(mine.sum())
+        )
+
+    def _coverage(self, camera: int) -> Coverage:
+        mine = self.inliers & (self.observations.camera == camera)
+        extent = np.ptp(self.observations.pixels[mine], axis=0) / self.observations.image_sizes[camera]
+        return Coverage(len(np.unique(self.observations.frame[mine])), float(np.clip(extent, 0, 1).prod()))
+
+
+def calibrate_rig(observations: Observations, options: CalibrationOptions) -> Calibration:
+    """Calibrate a rig from sightings of one board.
+
+    Raises:
+        CalibrationError: the sightings do not determine the rig: too few or too similar frames, cameras that
+            share none, boards parallel to the image, a camera that contradicts the others, or a lens that
+            folds inside its image. The message names the camera and the remedy.
+    """
+    all_views, view_of = stack_views(observations)
+    names, sizes = observations.camera_ids, observations.image_sizes
+    alone = calibrate_alone(all_views, names, sizes)
+    views = alone.views
+    adjusted = _first_solution(alone, names, sizes, options)
+    require_fit(views, adjusted, alone.trusted, names)
+    adjusted, warp, table = _modelled(views, adjusted, options, names, sizes)
+    if options.backend == "pycolmap":
+        adjusted = adjust_with_colmap(views, adjusted.state, adjusted.used, sizes)
+    require_fit(views, adjusted, alone.trusted, names)
+    free = free_head(adjusted.state, warp=warp)
+    known = uncertainty(views, adjusted.state, adjusted.used, free, names)
+    require_determined(views, adjusted, known, free, names)
+    cameras = tuple(
+        Camera(adjusted.state.model, *size, params)
+        for size, params in zip(sizes, adjusted.state.params, strict=True)
+    )
+    require_unfolded(cameras, names)
+    row = np.full(len(all_views), -1)
+    row[_rows(all_views, views)] = np.arange(len(views))
+    row_of = row[view_of]
+    inliers = (row_of >= 0) & adjusted.used[row_of, observations.point]
+    found = adjusted.residuals[row_of, observations.point]
+    return Calibration(
+        observations=observations,
+        cameras=cameras,
+        camera_from_rig=adjusted.state.camera_from_rig,
+        rig_from_board=_board_poses(views, adjusted, observations),
+        board_warp=adjusted.state.warp,
+        inliers=inliers,
+        residuals=np.where((row_of >= 0)[:, None], found, np.nan),
+        uncertainty=known,
+        held_out=_held_out_error(views, adjusted, free, options.folds),
+        selection=table,
+        sigma_alone=sigma_alone(alone),
+    )
+
+
+def _first_solution(
+    alone: Alone, names: tuple[str, ...], sizes: tuple[tuple[int, int], ...], options: CalibrationOptions
+) -> Adjusted:
+    """Adjust the rig robustly, under the asked or a flexible model and the board as flexible as allowed."""
+    model = FLEXIBLE_MODEL if options.camera_model == "auto" else options.camera_model
+    rough, trusted = assemble(alone, names, sizes)
+    start = rough.as_model(model)
+    return adjust_robustly(alone.views, start, trusted, free_head(start, warp=options.board_warp != "off"))
+
+
+def _modelled(
+    views: BoardViews,
+    adjusted: Adjusted,
+    options: CalibrationOptions,
+    names: tuple[str, ...],
+    sizes: tuple[tuple[int, int], ...],
+) -> tuple[Adjusted, bool, tuple[Candidate, ...]]:
+    """Settle the camera model and the board's shape: as asked, or by held-out frames."""
+    models = tuple(CAMERA_MODELS) if options.camera_model == "auto" else (options.camera_model,)
+    warps = {"auto": (False, True), "on": (True,), "off": (False,)}[options.board_warp]
+    if len(models) * len(warps) == 1:
+        return adjusted, warps[0], ()
+    table, state, warp = select_model(views, adjusted, models, warps, options.folds, names, sizes)
+    return least_squares(views, state, adjusted.used, free_head(state, warp=warp)), warp, table
+
+
+def _board_poses(views: BoardViews, adjusted: Adjusted, observations: Observations) -> dict[str, Rigid]:
+    """Poses of the board's own frame, whose origin need not be its middle."""
+    from_middle = Rigid(np.eye(3), -views.center)
+    poses = adjusted.state.rig_from_board
+    return {
+        observations.frame_ids[frame]: Rigid(poses.rotation[frame], poses.translation[frame]) @ from_middle
+        for frame in np.unique(views.frame[adjusted.used.any(axis=1)])
+    }
+
+
+def _held_out_error(
+    views: BoardViews, adjusted: Adjusted, free: np.ndarray, folds: int
+) -> HeldOutError | None:
+    frames = np.unique(views.frame[adjusted.used.any(axis=1)])
+    if len(frames) < 2 * folds:
+        return None
+    residual = held_out(views, adjusted, free, [frames[start::folds] for start in range(folds)])
+    squared = (residual**2).sum(axis=-1)
+    counted = np.isfinite(squared)
+    return HeldOutError(float(np.sqrt(squared[counted].mean())), int(counted.sum()))
+
+
+def _rows(all_views: BoardViews, views: BoardViews) -> np.ndarray:
+    """Which of all views the remaining ones are."""
+    key = all_views.camera * all_views.frames + all_views.frame
+    return np.searchsorted(key, views.camera * views.frames + views.frame)
