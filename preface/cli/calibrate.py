@@ -1,0 +1,294 @@
+"""``preface-calibrate``: from pictures of a board, or photographs, to a rig; and rigs of other programs.
+
+This module reads the command line and prints; `calibrate_board` and `calibrate_photos` do the work. They are
+imported when they are needed, so that ``--help`` does not wait for numpy.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from preface.artifacts import ArtifactError
+from preface.cli.usage import UsageError
+
+_DESCRIPTION = "Calibrate the cameras of a capture, or bring in the calibration of another program."
+_EPILOG = "Exit status: 0 when the rig was written, 1 when something is wrong, 2 for wrong usage."
+CAMERA_MODELS = ("PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+FORMATS = (
+    "colmap-text",
+    "colmap-binary",
+    "nerfstudio",
+    "opencv",
+    "anipose",
+    "caliscope",
+    "facescape",
+    "mrcal",
+    "cafca",
+    "nersemble",
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit status."""
+    parser = _parser()
+    config = parser.parse_args(arguments)
+    try:
+        lines = config.run(config)
+    except UsageError as error:
+        config.parser.error(str(error))
+    except ArtifactError as error:
+        print(error, file=sys.stderr)
+        return 1
+    except _reasons() as error:
+        print(f"{config.source}: {error}", file=sys.stderr)
+        return 1
+    return _print(lines)
+
+
+def _reasons() -> tuple[type[Exception], ...]:
+    """Errors that tell a user what to do; anything else is a defect of this program."""
+    from preface.capture.boards import BoardError
+    from preface.capture.calibration import CalibrationError
+    from preface.capture.observations import ObservationError
+    from preface.geometry.errors import GeometryError
+
+    return BoardError, CalibrationError, GeometryError, ObservationError
+
+
+def _print(lines: Sequence[str]) -> int:
+    """Print the result; a reader that has gone away does not undo what was written."""
+    try:
+        print(*lines, sep="\n", flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        print(ArtifactError.from_os("standard output", "writing", error), file=sys.stderr)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return 0
+
+
+# ------------------------------------------------------------------------------------- what to run
+
+
+def _run_board(config: argparse.Namespace) -> list[str]:
+    from preface.cli.calibrate_board import run
+
+    return run(config)
+
+
+def _run_photos(config: argparse.Namespace) -> list[str]:
+    from preface.cli.calibrate_photos import run
+
+    return run(config)
+
+
+def _run_import(config: argparse.Namespace) -> list[str]:
+    from dataclasses import replace
+
+    from preface.artifacts import provenance
+    from preface.capture.formats import read_rig_from
+    from preface.capture.rig import write_rig
+
+    rig = read_rig_from(config.source, config.format)
+    source = config.source
+    files = [source] if source.is_file() else sorted(f for f in source.iterdir() if f.is_file())
+    history = provenance({"command": "import", "format": config.format}, {file.name: file for file in files})
+    written = write_rig(config.output, replace(rig, take=config.take or rig.take, provenance=history))
+    assumed = [f"assumed: {words}" for words in rig.metadata["imported"]["assumptions"]]
+    return [
+        f"{len(rig.cameras)} cameras of format {rig.metadata['imported']['format']}",
+        *assumed,
+        str(written),
+    ]
+
+
+def _run_export(config: argparse.Namespace) -> list[str]:
+    from preface.capture.formats import export_rig
+    from preface.capture.rig import read_rig
+
+    return [str(export_rig(read_rig(config.source), config.output, config.format))]
+
+
+# --------------------------------------------------------------------------------------- the flags
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("preface-calibrate", description=_DESCRIPTION, epilog=_EPILOG)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    _add_board(commands)
+    _add_photos(commands)
+    _add_import(commands)
+    _add_export(commands)
+    return parser
+
+
+def _command(commands: Any, name: str, run: Any, words: str, source: str) -> argparse.ArgumentParser:
+    parser = commands.add_parser(
+        name, help=words[:1].lower() + words[1:], description=f"{words}.", epilog=_EPILOG
+    )
+    parser.set_defaults(run=run, parser=parser, command=name)
+    parser.add_argument("source", metavar=source.split(":")[0], type=Path, help=source.split(": ")[1])
+    return parser
+
+
+def _add_board(commands: Any) -> None:
+    words = "Calibrate fixed cameras from pictures of a board"
+    parser = _command(
+        commands, "board", _run_board, words, "CAPTURE: folder of the capture, or its capture.json"
+    )
+    board = parser.add_argument_group("the board (default: as the manifest says)")
+    board.add_argument("--board", choices=("charuco", "chessboard", "aprilgrid"), help="what it is")
+    board.add_argument(
+        "--squares",
+        metavar="COLUMNSxROWS",
+        help="of squares; inner corners of a chessboard, tags of an aprilgrid",
+    )
+    board.add_argument(
+        "--square-size",
+        type=_length,
+        metavar="METRES",
+        help="edge of a square, measured; tag to tag in an aprilgrid",
+    )
+    board.add_argument("--marker-size", type=_length, metavar="METRES", help="edge of a marker")
+    board.add_argument("--dictionary", metavar="NAME", help="OpenCV's name, such as DICT_4X4_50")
+    board.add_argument("--legacy", action="store_true", help="a ChArUco board made with OpenCV before 4.6")
+    board.add_argument("--inverted", action="store_true", help="printed white on black")
+    model = parser.add_argument_group("the model")
+    model.add_argument(
+        "--camera-model",
+        choices=("auto", *CAMERA_MODELS),
+        default="auto",
+        help="auto: the simplest that held-out frames support",
+    )
+    model.add_argument(
+        "--board-warp",
+        choices=("auto", "on", "off"),
+        default="auto",
+        help="whether the board may bow; auto: if held-out frames support it",
+    )
+    model.add_argument(
+        "--backend", choices=("own", "pycolmap"), default="own", help="who solves (default: own)"
+    )
+    model.add_argument(
+        "--held-out",
+        type=_at_least(2),
+        default=5,
+        metavar="N",
+        help="hold every N-th frame out, each in turn, to measure the error on frames not seen (default: 5)",
+    )
+    parser.add_argument(
+        "--take", action="append", metavar="NAME", help="only this take; may be given several times"
+    )
+    parser.add_argument(
+        "--leave-out",
+        action="append",
+        metavar="CAMERA",
+        help="without this camera; may be given several times",
+    )
+    parser.add_argument(
+        "--known-distance",
+        nargs=3,
+        metavar=("CAMERA", "CAMERA", "METRES"),
+        help="a measured distance between two cameras, which shows a wrong square size",
+    )
+    parser.add_argument(
+        "--search-side",
+        type=_at_least(64),
+        default=2048,
+        metavar="PIXELS",
+        help="boards are searched for in images reduced to this longer side (default: 2048)",
+    )
+    parser.add_argument(
+        "--every",
+        type=_at_least(1),
+        default=1,
+        metavar="N",
+        help="take every N-th frame of videos without timestamps",
+    )
+    parser.add_argument(
+        "--corners",
+        type=Path,
+        metavar="FILE",
+        help="use these corners (corners.json) instead of finding the board",
+    )
+    parser.add_argument(
+        "--jobs", type=_at_least(1), metavar="N", help="processes that find boards (default: all cores)"
+    )
+    _add_output(parser, "for several takes a folder, which then holds rigs/TAKE.json")
+
+
+def _add_photos(commands: Any) -> None:
+    words = "Calibrate from photographs of one person, taken with one or more cameras from all around"
+    parser = _command(commands, "photos", _run_photos, words, "CAPTURE: folder of the photographs")
+    parser.add_argument(
+        "--cameras",
+        choices=("one", "folder", "each"),
+        default="one",
+        help="which photographs share a lens: all, those of a folder, or none (default: one)",
+    )
+    parser.add_argument(
+        "--masks", type=Path, metavar="FOLDER", help="masks, one per photograph, of where to look"
+    )
+    parser.add_argument(
+        "--known-distance",
+        nargs=3,
+        metavar=("PHOTO", "PHOTO", "METRES"),
+        help="distance between two photographs' cameras; without it the scale is arbitrary",
+    )
+    parser.add_argument("--take", metavar="NAME", default="photos", help="name of the take (default: photos)")
+    parser.add_argument("--seed", type=_at_least(0), default=0, help="of everything random (default: 0)")
+    parser.add_argument("--jobs", type=_at_least(1), metavar="N", help="threads (default: all cores)")
+    _add_output(parser, "the rig, with one camera per photograph")
+
+
+def _add_import(commands: Any) -> None:
+    words = "Read a rig of another program"
+    parser = _command(commands, "import", _run_import, words, "SOURCE: its file or folder")
+    parser.add_argument("--format", choices=FORMATS, help="default: found out")
+    parser.add_argument("--take", metavar="NAME", help="name of the take (default: default)")
+    parser.add_argument(
+        "--output", type=Path, default=Path("rig.json"), metavar="PATH", help="default: rig.json"
+    )
+
+
+def _add_export(commands: Any) -> None:
+    words = "Write a rig for another program"
+    parser = _command(commands, "export", _run_export, words, "RIG: rig.json, or a folder that holds one")
+    parser.add_argument("--format", choices=FORMATS, required=True, help="what to write")
+    parser.add_argument("--output", type=Path, required=True, metavar="PATH", help="file or folder to write")
+
+
+def _add_output(parser: argparse.ArgumentParser, more: str) -> None:
+    parser.add_argument(
+        "--output", type=Path, default=Path("rig.json"), metavar="PATH", help=f"default: rig.json; {more}"
+    )
+    parser.add_argument(
+        "--report", type=Path, metavar="PATH.html", help="default: beside the rig, as rig.report.html"
+    )
+
+
+def _length(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a length in metres; write for example 0.022")
+    return value
+
+
+def _at_least(smallest: int) -> Any:
+    def number(text: str) -> int:
+        if not text.isdecimal() or int(text) < smallest:
+            raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least {smallest}")
+        return int(text)
+
+    return number
+
+
+if __name__ == "__main__":
+    sys.exit(main())
