@@ -34,6 +34,7 @@ VERSIONED_PACKAGES = (
     "opencv-contrib-python-headless",
     "OpenEXR",
     "mediapipe",
+    "pycolmap",
 )
 LINE_LENGTH = 100  # written values that fit on one such line stay on one line
 

@@ -88,7 +88,16 @@ def _start(config: StudioConfig, subject_module: str, stop: Event, finished: Syn
     global _worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     _worker = _Worker(Studio(config, subject_module), stop, finished)
+
+
+def _end_with_parent() -> None:
+    """Leave when the main process is gone: killed outright, it cannot stop its workers. Files are atomic."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _run(task: Task) -> None:
