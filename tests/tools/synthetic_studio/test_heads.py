@@ -104,7 +104,7 @@ def test_coverage_is_fractional_at_edges_and_full_inside(front):
 
 def test_depth_and_coverage_agree(front):
     # The ray through a centre may slip between strands that cover the samples around it.
-    assert np.isfinite(front.depth)[front.alpha == 1.0].mean() > 0.995
+    assert np.isfinite(front.depth)[front.alpha == 1.0].mean() > 0.98
     assert np.isnan(front.depth)[front.alpha == 0.0].mean() > 0.99
     assert (np.isnan(front.normals).any(axis=-1) == np.isnan(front.depth)).all()
 
