@@ -5,6 +5,7 @@ The result is independent of the view and is computed once per identity.
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import open3d as o3d
@@ -23,6 +24,7 @@ class Lights:
     is_key: np.ndarray
 
 
+@cache
 def studio_lights() -> Lights:
     """Return the lights, scaled so that a white surface that faces the camera has radiance of about 0.9."""
     surround = _fibonacci_sphere(64)
