@@ -106,6 +106,8 @@ def _summary(report: Report, calibration: Calibration) -> None:
             KeyFigure("Bow of the board", bow, "mm") if bow else KeyFigure("Board", "flat"),
         ]
     )
+    for warning in calibration.warnings:
+        section.text(f"Note: {warning}.")
 
 
 def _cameras(report: Report, calibration: Calibration) -> None:
@@ -177,9 +179,11 @@ def _residuals(report: Report, calibration: Calibration) -> None:
 
 
 def _frames(report: Report, calibration: Calibration) -> None:
-    section = report.section("Frames")
+    section = report.section(
+        "Frames", "Reprojection errors as if the board stood still in each frame, whatever cameras saw it when."
+    )
     seen = calibration.observations
-    squared = np.where(calibration.inliers, (calibration.residuals**2).sum(axis=-1), 0.0)
+    squared = np.where(calibration.inliers, (calibration.residuals_at_rest**2).sum(axis=-1), 0.0)
     frames, cameras = len(seen.frame_ids), len(seen.camera_ids)
     count = np.bincount(seen.frame, calibration.inliers, frames)
     total = np.bincount(seen.frame, minlength=frames)
@@ -252,6 +256,7 @@ def _selection(report: Report, calibration: Calibration) -> None:
             "excess": candidate.excess,
             "± excess": candidate.standard_error,
             "verdict": "chosen" if candidate.chosen else candidate.refused.partition(";")[0] or "possible",
+            "held at 0": ", ".join(candidate.held),
         }
         for candidate in calibration.selection
     ]

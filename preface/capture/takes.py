@@ -1,7 +1,8 @@
 """All takes of a capture, one rig each, and what moved between them.
 
 The cameras are the same in every take, so that the camera model and the board's shape are chosen once, on the
-take with the most sightings, and then hold for all; parameters and poses are each take's own.
+take with the most sightings, and then hold for all; parameters and poses are each take's own, and each take
+begins with the lenses of its neighbour.
 """
 
 from collections.abc import Mapping, Sequence
@@ -71,7 +72,8 @@ def calibrate_takes(takes: Mapping[str, Observations], options: CalibrationOptio
     for index in sorted(range(len(names)), key=lambda index: abs(index - first)):
         name = names[index]
         try:
-            found[name] = calibrate_rig(takes[name], options)
+            neighbour = names[index + np.sign(first - index)]
+            found[name] = calibrate_rig(takes[name], options, found.get(neighbour))
         except CalibrationError as error:
             raise CalibrationError(f"take '{name}': {error}" if len(names) > 1 else str(error)) from error
         options = settled(options, found[name])

@@ -51,6 +51,8 @@ def run(config: argparse.Namespace) -> list[str]:
     began = time.perf_counter()
     lines = []
     for index, job in enumerate(jobs):
+        for warning in found[job.take.id].warnings:
+            _say(f"note: take '{job.take.id}': {warning}")
         before = jobs[index - 1] if index else None
         lines += _write(config, job, found[job.take.id], _drifts(before, job, found))
     _say(f"reported in {time.perf_counter() - began:.1f} s")

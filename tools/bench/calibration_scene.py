@@ -37,6 +37,10 @@ class SceneConfig:
         partial: share of views in which part of the board is hidden.
         distortion: k1, k2, p1, p2; varied by a fifth from camera to camera.
         aspect: standard deviation of fy/fx - 1 from camera to camera.
+        lag: each view is taken this much too early or late (standard deviation), seconds; 0 for cameras that
+            are triggered together. Boards move at up to `speed` and turn at up to `spin`.
+        speed: metres per second.
+        spin: radians per second.
     """
 
     cameras: int = 13
@@ -56,6 +60,9 @@ class SceneConfig:
     partial: float = 0.3
     distortion: tuple[float, float, float, float] = (-0.1, 0.05, 3e-4, -2e-4)
     aspect: float = 1e-3
+    lag: float = 0.0
+    speed: float = 0.15
+    spin: float = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +108,8 @@ def simulate(config: SceneConfig, seed: int) -> Scene:
         )
         for f in range(config.frames):
             pose = Rigid(camera_from_board.rotation[f], camera_from_board.translation[f])
+            if config.lag:
+                pose = _elsewhen(pose, middle, config, rng)
             projected, seen = camera.project(pose.apply(bowed))
             seen &= ((projected > 0) & (projected < (config.width, config.height))).all(axis=1)
             towards = pose.translation + pose.rotation @ np.append(middle, 0)
@@ -194,6 +203,17 @@ def _boards(config: SceneConfig, camera_from_head: Rigid, rng: np.random.Generat
         rotation.append(turned)
         translation.append(rng.uniform(-1, 1, 3) * reach - turned @ middle)
     return Rigid(np.array(rotation), np.array(translation))
+
+
+def _elsewhen(pose: Rigid, middle: np.ndarray, config: SceneConfig, rng: np.random.Generator) -> Rigid:
+    """Where the board is a random time before or after; its motion has any direction, seen from any camera."""
+    late = config.lag * rng.normal()
+    velocity, spin = rng.normal(size=(2, 3))
+    velocity *= config.speed * rng.random() / np.linalg.norm(velocity)
+    spin *= config.spin * rng.random() / np.linalg.norm(spin)
+    about = np.append(middle, 0)
+    turned = Rotation.from_rotvec(late * spin).as_matrix() @ pose.rotation
+    return Rigid(turned, pose.apply(about) + late * velocity - turned @ about)
 
 
 def _disturbed(

@@ -7,7 +7,7 @@ sightings come back as soon as the solution explains them, so that good ones are
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -128,10 +128,12 @@ def _point(views: BoardViews, state: RigState, used: np.ndarray, cauchy: float) 
     weights = used.astype(float)
     if not np.isfinite(squared).all():
         return _Point(state, residual, rows, np.inf, weights)
+    moving = state.motion.cost(views) if state.motion else 0.0
     if np.isinf(cauchy):
-        return _Point(state, residual, rows, float(squared.sum()), weights)
+        return _Point(state, residual, rows, moving + float(squared.sum()), weights)
     share = squared / cauchy**2
-    return _Point(state, residual, rows, float(cauchy**2 * np.log1p(share).sum()), weights / (1 + share))
+    cost = moving + float(cauchy**2 * np.log1p(share).sum())
+    return _Point(state, residual, rows, cost, weights / (1 + share))
 
 
 def _step(
@@ -148,7 +150,10 @@ def _step(
         head_step, tail_step, ahead = equations.step(damping)
         head = np.zeros(len(free))
         head[free] = head_step
-        return _point(views, at.state.moved(head, tail_step), used, cauchy), ahead
+        state = at.state.moved(head, tail_step)
+        if state.motion:
+            state = replace(state, motion=state.motion.moved(views, equations.view_step(head, tail_step)))
+        return _point(views, state, used, cauchy), ahead
     except (np.linalg.LinAlgError, GeometryError):  # too little damping for a direction that nothing fixes
         return at._replace(cost=np.inf), np.inf
 

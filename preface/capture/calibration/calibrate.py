@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
+import cv2
 import numpy as np
 
-from preface.capture.calibration.adjustment import Adjusted, adjust_robustly, least_squares
+from preface.capture.calibration.adjustment import Adjusted, adjust_robustly, least_squares, minimise
 from preface.capture.calibration.colmap_backend import adjust_with_colmap
 from preface.capture.calibration.covariance import Uncertainty, uncertainty
 from preface.capture.calibration.determined import require_determined, require_fit, require_unfolded
 from preface.capture.calibration.errors import CalibrationError
-from preface.capture.calibration.initial import Alone, calibrate_alone, sigma_alone
+from preface.capture.calibration.folding import unfolded
+from preface.capture.calibration.initial import FLEXIBLE_MODEL, Alone, calibrate_alone, sigma_alone
 from preface.capture.calibration.selection import Candidate, held_out, select_model
 from preface.capture.calibration.spanning_tree import assemble
 from preface.capture.calibration.state import free_head
+from preface.capture.calibration.unsynchronised import UNSYNCHRONISED, adjust_moving, unsynchronised
 from preface.capture.calibration.views import BoardViews, stack_views
 from preface.capture.observations import Observations
 from preface.capture.rig import Coverage, HeldOutError, ReprojectionError, Rig, RigCamera, StandardDeviations
@@ -24,10 +27,6 @@ from preface.geometry.cameras import CAMERA_MODELS, Camera
 from preface.geometry.transforms import Rigid
 
 CameraModel = Literal["auto", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"]
-# What the inliers are found with before a model is chosen: flexible enough for ordinary lenses.
-FLEXIBLE_MODEL = "OPENCV"
-# A rig's errors beyond this multiple of its cameras' own come from the rig: time, or motion.
-UNSYNCHRONISED = 2.0
 
 
 @dataclass(frozen=True)
@@ -66,12 +65,16 @@ class Calibration:
         rig_from_board: pose of the board by frame id; frames that nothing sure was seen in are absent.
         board_warp: [2] metres, the bow of the board's middle along x and along y; zero for a flat board.
         inliers: [M], the sightings that the rig was fitted to.
-        residuals: [M, 2] pixels, projected minus measured, also of outliers; NaN in frames that are absent.
+        residuals: [M, 2] pixels, projected minus measured, also of outliers; NaN in frames that are absent. Where
+            cameras are not simultaneous, the board is projected from where it was in each view.
         uncertainty: covariances, first camera as datum; `uncertainty.under("boards")` is free of the gauge.
         held_out: error over frames that were held out in turn; None if there were too few.
         selection: the candidates among which models were chosen, simplest first; empty without a choice.
         sigma_alone: noise per coordinate, pixels, when every view has a board pose of its own: what the
-            corners are worth. `uncertainty.sigma` is much larger if cameras are not simultaneous.
+            corners are worth.
+        motion: typical turn (radians) and shift (metres) of the board between a frame's views, along each axis,
+            where cameras turned out not to be simultaneous; None otherwise.
+        residuals_at_rest: [M, 2] pixels, as if the board stood still in each frame, where `rig_from_board` has it.
     """
 
     observations: Observations
@@ -85,10 +88,21 @@ class Calibration:
     held_out: HeldOutError | None
     selection: tuple[Candidate, ...]
     sigma_alone: float
+    motion: tuple[float, float] | None
+    residuals_at_rest: np.ndarray
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a user should know although the calibration went through."""
+        if self.motion is not None:
+            turn, shift = self.motion
+            return (
+                f"the cameras do not take a frame at the same instant: from view to view the board moves by "
+                f"{1e3 * shift:.2g} mm and {np.degrees(turn):.2g} degrees along each axis. Lenses were "
+                "calibrated from each view's own shape, poses from the mean over frames. The reprojection RMS of "
+                f"{self.reprojection_rms:.3f} px has this motion taken out; with a board at rest in each frame it is "
+                f"{self.reprojection_rms_at_rest:.2f} px. Hold the board still, or trigger the cameras together",
+            )
         ratio = self.uncertainty.sigma / self.sigma_alone
         if ratio < UNSYNCHRONISED:
             return ()
@@ -102,6 +116,11 @@ class Calibration:
     def reprojection_rms(self) -> float:
         """Over the inliers, pixels."""
         return float(np.sqrt((self.residuals[self.inliers] ** 2).sum(axis=-1).mean()))
+
+    @property
+    def reprojection_rms_at_rest(self) -> float:
+        """Over the inliers, pixels, as if the board stood still in each frame."""
+        return float(np.sqrt((self.residuals_at_rest[self.inliers] ** 2).sum(axis=-1).mean()))
 
     def point_covariance(self, points: np.ndarray, pixel_noise: float) -> np.ndarray:
         """Predict the covariance [N, 3, 3] of triangulated points [N, 3] (rig frame), calibration and noise.
@@ -135,7 +154,14 @@ class Calibration:
                 covariance=tuple(tuple(row) for row in self.uncertainty.camera(index).tolist()),
                 coverage=self._coverage(index),
             )
-        return Rig(take, cameras, self.held_out)
+        metadata = {}
+        if self.motion is not None:
+            metadata["motion_within_frames"] = {
+                "rotation": self.motion[0],
+                "translation": self.motion[1],
+                "reprojection_rms_at_rest": self.reprojection_rms_at_rest,
+            }
+        return Rig(take, cameras, self.held_out, metadata=metadata)
 
     def _reprojection_error(self, camera: int) -> ReprojectionError:
         mine = self.inliers & (self.observations.camera == camera)
@@ -146,12 +172,21 @@ class Calibration:
 
     def _coverage(self, camera: int) -> Coverage:
         mine = self.inliers & (self.observations.camera == camera)
-        extent = np.ptp(self.observations.pixels[mine], axis=0) / self.observations.image_sizes[camera]
-        return Coverage(len(np.unique(self.observations.frame[mine])), float(np.clip(extent, 0, 1).prod()))
+        hull = cv2.convexHull(self.observations.pixels[mine].astype(np.float32))
+        width, height = self.observations.image_sizes[camera]
+        share = min(cv2.contourArea(hull) / (width * height), 1.0)
+        return Coverage(len(np.unique(self.observations.frame[mine])), share)
 
 
-def calibrate_rig(observations: Observations, options: CalibrationOptions) -> Calibration:
+def calibrate_rig(
+    observations: Observations, options: CalibrationOptions, start: Calibration | None = None
+) -> Calibration:
     """Calibrate a rig from sightings of one board.
+
+    Args:
+        observations: the sightings.
+        options: how to.
+        start: of the same cameras at another time, whose lenses are begun with unless they contradict.
 
     Raises:
         CalibrationError: the sightings do not determine the rig: too few or too similar frames, cameras that
@@ -160,15 +195,16 @@ def calibrate_rig(observations: Observations, options: CalibrationOptions) -> Ca
     """
     all_views, view_of = stack_views(observations)
     names, sizes = observations.camera_ids, observations.image_sizes
-    alone = calibrate_alone(all_views, names, sizes)
+    lenses = dict(zip(start.observations.camera_ids, start.cameras, strict=True)) if start else {}
+    alone = calibrate_alone(all_views, names, sizes, lenses)
     views = alone.views
-    adjusted = _first_solution(alone, names, sizes, options)
+    noise = sigma_alone(alone)
+    adjusted = _first_solution(alone, names, sizes, options, noise)
     require_fit(views, adjusted, alone.trusted, names)
-    adjusted, warp, table = _modelled(views, adjusted, options, names, sizes)
+    adjusted, free, table = _modelled(views, adjusted, options, names, sizes)
     if options.backend == "pycolmap":
         adjusted = adjust_with_colmap(views, adjusted.state, adjusted.used, sizes)
     require_fit(views, adjusted, alone.trusted, names)
-    free = free_head(adjusted.state, warp=warp)
     known = uncertainty(views, adjusted.state, adjusted.used, free, names)
     require_determined(views, adjusted, known, free, names)
     cameras = tuple(
@@ -176,34 +212,63 @@ def calibrate_rig(observations: Observations, options: CalibrationOptions) -> Ca
         for size, params in zip(sizes, adjusted.state.params, strict=True)
     )
     require_unfolded(cameras, names)
+    at_rest = _at_rest(views, adjusted)
     row = np.full(len(all_views), -1)
     row[_rows(all_views, views)] = np.arange(len(views))
     row_of = row[view_of]
     inliers = (row_of >= 0) & adjusted.used[row_of, observations.point]
-    found = adjusted.residuals[row_of, observations.point]
+    known_row = (row_of >= 0)[:, None]
     return Calibration(
         observations=observations,
         cameras=cameras,
         camera_from_rig=adjusted.state.camera_from_rig,
-        rig_from_board=_board_poses(views, adjusted, observations),
+        rig_from_board=_board_poses(views, at_rest, observations),
         board_warp=adjusted.state.warp,
         inliers=inliers,
-        residuals=np.where((row_of >= 0)[:, None], found, np.nan),
+        residuals=np.where(known_row, adjusted.residuals[row_of, observations.point], np.nan),
         uncertainty=known,
         held_out=_held_out_error(views, adjusted, free, options.folds),
         selection=table,
-        sigma_alone=sigma_alone(alone),
+        sigma_alone=noise,
+        motion=_motion(adjusted),
+        residuals_at_rest=np.where(known_row, at_rest.residuals[row_of, observations.point], np.nan),
     )
 
 
 def _first_solution(
-    alone: Alone, names: tuple[str, ...], sizes: tuple[tuple[int, int], ...], options: CalibrationOptions
+    alone: Alone,
+    names: tuple[str, ...],
+    sizes: tuple[tuple[int, int], ...],
+    options: CalibrationOptions,
+    noise: float,
 ) -> Adjusted:
-    """Adjust the rig robustly, under the asked or a flexible model and the board as flexible as allowed."""
+    """Adjust the rig robustly, under the asked or a flexible model and the board as flexible as allowed.
+
+    Where the cameras alone fit much better, to `noise` pixels, the board may move within frames.
+    """
     model = FLEXIBLE_MODEL if options.camera_model == "auto" else options.camera_model
     rough, trusted = assemble(alone, names, sizes)
     start = rough.as_model(model)
-    return adjust_robustly(alone.views, start, trusted, free_head(start, warp=options.board_warp != "off"))
+    free = free_head(start, warp=options.board_warp != "off")
+    adjusted = adjust_robustly(alone.views, start, trusted, free)
+    if options.backend == "own" and unsynchronised(adjusted, trusted, noise):
+        return adjust_moving(alone, start, trusted, free)
+    return adjusted
+
+
+def _motion(adjusted: Adjusted) -> tuple[float, float] | None:
+    if adjusted.state.motion is None:
+        return None
+    return float(adjusted.state.motion.deviations[0]), float(adjusted.state.motion.deviations[3])
+
+
+def _at_rest(views: BoardViews, adjusted: Adjusted) -> Adjusted:
+    """The solution with boards that stand still in each frame, where they suit all its views best."""
+    if adjusted.state.motion is None:
+        return adjusted
+    still = replace(adjusted.state, motion=None)
+    state, residual = minimise(views, still, adjusted.used, np.zeros(still.head_size, bool))
+    return Adjusted(state, adjusted.used, np.where(views.seen[..., None], residual, np.nan))
 
 
 def _modelled(
@@ -212,14 +277,15 @@ def _modelled(
     options: CalibrationOptions,
     names: tuple[str, ...],
     sizes: tuple[tuple[int, int], ...],
-) -> tuple[Adjusted, bool, tuple[Candidate, ...]]:
-    """Settle the camera model and the board's shape: as asked, or by held-out frames."""
+) -> tuple[Adjusted, np.ndarray, tuple[Candidate, ...]]:
+    """Settle the camera model and the board's shape: as asked, or by held-out frames; say what is free [Nh]."""
     models = tuple(CAMERA_MODELS) if options.camera_model == "auto" else (options.camera_model,)
     warps = {"auto": (False, True), "on": (True,), "off": (False,)}[options.board_warp]
     if len(models) * len(warps) == 1:
-        return adjusted, warps[0], ()
-    table, state, warp = select_model(views, adjusted, models, warps, options.folds, names, sizes)
-    return least_squares(views, state, adjusted.used, free_head(state, warp=warp)), warp, table
+        adjusted, free = unfolded(views, adjusted, free_head(adjusted.state, warp=warps[0]), sizes)
+        return adjusted, free, ()
+    table, state, free = select_model(views, adjusted, models, warps, options.folds, names, sizes)
+    return least_squares(views, state, adjusted.used, free), free, table
 
 
 def _board_poses(views: BoardViews, adjusted: Adjusted, observations: Observations) -> dict[str, Rigid]:

@@ -165,10 +165,11 @@ def uncertainty(
     equations = normal_equations(views, state, rows, used.astype(float))
     frames_used = np.bincount(views.frame, used.sum(axis=1), views.frames) > 0
     if sigma is None:
-        excess = 2 * used.sum() - free.sum() - 6 * frames_used.sum()
+        unknowns = free.sum() + 6 * frames_used.sum() + _freedom_of_motion(views, equations, used)
+        excess = 2 * used.sum() - unknowns
         if excess <= 0:
             raise CalibrationError(
-                f"frames: {2 * used.sum()} coordinates for {free.sum() + 6 * frames_used.sum()} unknowns; "
+                f"frames: {2 * used.sum()} coordinates for {unknowns:.0f} unknowns; "
                 "show the board in more frames, or use a simpler camera model"
             )
         sigma = float(np.sqrt((residual[used] ** 2).sum() / excess))
@@ -183,6 +184,16 @@ def uncertainty(
     noise = np.einsum("fij,fjk,flk->il", weights, inverse, weights)
     square = sigma**2
     return Uncertainty(state, sigma, square * head, square * boards, shift, square * noise)
+
+
+def _freedom_of_motion(views: BoardViews, equations: NormalEquations, used: np.ndarray) -> float:
+    """How many unknowns the motion within frames amounts to beside the poses of the frames."""
+    if equations.moving is None:
+        return 0.0
+    views_of_frame = np.bincount(views.frame, used.any(axis=1), views.frames)[views.frame]
+    # Of K views with poses of their own, one takes its frame's place.
+    beyond = 1 - 1 / np.maximum(views_of_frame, 1)
+    return float((equations.moving.elimination.freedom * beyond * used.any(axis=1)).sum())
 
 
 def _inverse(

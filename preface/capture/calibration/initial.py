@@ -7,6 +7,7 @@ the image's middle), and each then gives the board's pose.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -16,17 +17,22 @@ from preface.capture.calibration.adjustment import CAUCHY_SIGMAS, minimise, resi
 from preface.capture.calibration.errors import CalibrationError
 from preface.capture.calibration.state import RigState, free_head
 from preface.capture.calibration.views import BoardViews
+from preface.geometry.cameras import Camera
 from preface.geometry.transforms import Rigid, nearest_rotation
 
 # Distortion bends a homography by less than this share of the board's extent in the image.
 HOMOGRAPHY_TOLERANCE = 0.01
 HOMOGRAPHY_TOLERANCE_PIXELS = 2.0
+# What noise is judged with, and the inliers are found with: flexible enough for ordinary lenses.
+FLEXIBLE_MODEL = "OPENCV"
 # Points that a view must have: four fix a homography, two more check it.
 MIN_POINTS = 6
 # Views of a camera that must differ: each gives two equations, for focal length, principal point, distortion.
 MIN_VIEWS = 3
 # Boards closer than this in the image, pixels, are one and the same.
 SAME_VIEW = 1.0
+# Homographies alone give the focal length to a few per cent; a lens further off is another one, or was zoomed.
+SAME_LENS = 0.15
 # Focal lengths that are tried, in image widths or heights, whichever is greater.
 FOCAL_RANGE = np.geomspace(0.2, 100, 200)
 
@@ -47,9 +53,17 @@ class Alone:
 
 
 def calibrate_alone(
-    views: BoardViews, camera_ids: tuple[str, ...], image_sizes: tuple[tuple[int, int], ...]
+    views: BoardViews,
+    camera_ids: tuple[str, ...],
+    image_sizes: tuple[tuple[int, int], ...],
+    start: Mapping[str, Camera],
 ) -> Alone:
-    """Find focal length, one radial coefficient and board poses of each camera for itself.
+    """Find focal length, distortion and board poses of each camera for itself.
+
+    Args:
+        views, camera_ids, image_sizes: the problem.
+        start: lenses by camera from elsewhere, of one model; they are begun with if all cameras have one and
+            the homographies do not contradict. One radial coefficient is found without.
 
     Raises:
         CalibrationError: a camera that sees too few, or too few different, boards.
@@ -59,28 +73,53 @@ def calibrate_alone(
     views, homographies, trusted = views.select(keep), homographies[keep], trusted[keep]
     sizes = np.array(image_sizes, float)
     require_views(views, homographies, camera_ids)
-    middle = sizes / 2
-    centred = homographies.copy()
-    centred[:, :2] -= middle[views.camera][..., None] * homographies[:, 2:]
     focal = np.array(
         [
-            best_focal(centred[views.camera == camera], float(sizes[camera].max()))
-            for camera in range(views.cameras)
+            best_focal(_centred(homographies[views.camera == c], size / 2), float(size.max()))
+            for c, size in enumerate(sizes)
         ]
     )
-    poses = poses_of_homographies(centred, focal[views.camera])
-    params = np.stack([focal, middle[:, 0], middle[:, 1], np.zeros_like(focal)], axis=-1)
+    model, params = _starting_lenses(focal, sizes, [start.get(name) for name in camera_ids])
     still = Rigid(np.tile(np.eye(3), (views.cameras, 1, 1)), np.zeros((views.cameras, 3)))
-    state = RigState("SIMPLE_RADIAL", params, still, poses, np.zeros(2))
+    state = RigState(model, params, still, still, np.zeros(2))
+    lens = state.intrinsics[views.camera]
+    poses = poses_of_homographies(_centred(homographies, lens[:, 2:4]), lens[:, 0])
+    state = replace(state, rig_from_board=poses)
     return Alone(views, trusted, refine_alone(views.apart(), state, trusted))
+
+
+def _centred(homographies: np.ndarray, principal_point: np.ndarray) -> np.ndarray:
+    """Homographies [n, 3, 3] to pixels about the principal point [2] or [n, 2]."""
+    centred = homographies.copy()
+    centred[:, :2] -= principal_point[..., None] * homographies[:, 2:]
+    return centred
+
+
+def _starting_lenses(
+    focal: np.ndarray, sizes: np.ndarray, given: Sequence[Camera | None]
+) -> tuple[str, np.ndarray]:
+    """Model and parameters [C, n] to begin with: the lenses given, unless one contradicts its focal length [C]."""
+    lenses = [
+        lens
+        for lens, found in zip(given, focal, strict=True)
+        if lens and abs(np.log(lens.intrinsics[0] / found)) < SAME_LENS
+    ]
+    if len(lenses) == len(focal):
+        return lenses[0].model, np.stack([lens.params for lens in lenses])
+    middle = sizes / 2
+    params = np.stack([focal, middle[:, 0], middle[:, 1], np.zeros_like(focal)], axis=-1)
+    return "SIMPLE_RADIAL", params
 
 
 def sigma_alone(alone: Alone) -> float:
     """Noise per coordinate, pixels, that the cameras show alone, each view with its own board pose."""
-    residual = residuals(alone.views.apart(), alone.state)
-    # The six numbers of a pose absorb some of the noise.
-    coordinates = 2 * alone.trusted.sum(axis=1).mean()
-    return spread(residual, alone.trusted) * float(np.sqrt(coordinates / (coordinates - 6)))
+    views, state = alone.views.apart(), alone.state.as_model(FLEXIBLE_MODEL)
+    free = free_head(state, poses=False)
+    state = _robust_rounds(views, state, alone.trusted, free)
+    # The unknowns, six numbers of each pose among them, absorb some of the noise.
+    coordinates = 2 * alone.trusted.sum()
+    left = max(coordinates - 6 * len(views) - free.sum(), 0.1 * coordinates)
+    return spread(residuals(views, state), alone.trusted) * float(np.sqrt(coordinates / left))
 
 
 def refine_alone(views: BoardViews, state: RigState, trusted: np.ndarray) -> RigState:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from preface.capture.calibration.motion import Elimination, eliminate
 from preface.capture.calibration.state import RigState, expansion
 from preface.capture.calibration.views import BoardViews
 from preface.geometry import lens
@@ -29,6 +30,7 @@ class NormalEquations:
         cross: [F, 6, Nh].
         head_gradient: [Nh].
         frame_gradient: [F, 6].
+        moving: recovers the motion within frames from the rest, given a whole head; None without any.
     """
 
     head: np.ndarray
@@ -36,6 +38,7 @@ class NormalEquations:
     cross: np.ndarray
     head_gradient: np.ndarray
     frame_gradient: np.ndarray
+    moving: _Moving | None = None
 
     def restricted(self, free: np.ndarray) -> NormalEquations:
         """Return the equations of the free entries of the head, by mask [Nh]."""
@@ -45,6 +48,7 @@ class NormalEquations:
             self.cross[..., free],
             self.head_gradient[free],
             self.frame_gradient,
+            self.moving,
         )
 
     def step(self, damping: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -81,7 +85,28 @@ class NormalEquations:
         frame_step = -by_gradient - by_head @ head_step
         slope = head_step @ self.head_gradient + (frame_step * self.frame_gradient).sum()
         damped = head_step @ (head_scale * head_step) + (frame_scale * frame_step**2).sum()
-        return head_step, frame_step, float(0.5 * (damping * damped - slope))
+        alone = self.moving.elimination.gain if self.moving else 0.0
+        return head_step, frame_step, alone + float(0.5 * (damping * damped - slope))
+
+    def view_step(self, head_step: np.ndarray, frame_step: np.ndarray) -> np.ndarray:
+        """The step [V, 6] of the motion within frames beside steps of the whole head [Nh] and frames [F, 6]."""
+        at = self.moving
+        if at is None:
+            raise ValueError("the board does not move within frames")
+        rows = (at.of_head @ head_step[at.head_index][..., None])[..., 0]
+        n = rows.shape[1] - 9
+        rows[:, n : n + 6] += (at.of_frame @ frame_step[at.frame][..., None])[..., 0]
+        return -at.elimination.constant - (at.elimination.by_rows @ rows[:, :-1, None])[..., 0]
+
+
+class _Moving(NamedTuple):
+    """The motion's elimination, and how a view's rows follow from head and frame (see `_adjoints`)."""
+
+    elimination: Elimination
+    of_head: np.ndarray
+    of_frame: np.ndarray
+    head_index: np.ndarray
+    frame: np.ndarray
 
 
 def _diagonal(matrix: np.ndarray) -> np.ndarray:
@@ -210,9 +235,13 @@ def normal_equations(
 
     cameras, n = state.params.shape
     of_head, of_frame = _adjoints(views, state)
+    index = _head_index(views, cameras, n)
+    moving = None
+    if state.motion:
+        squared, elimination = eliminate(views, state.motion, squared, slice(n, n + 6))
+        moving = _Moving(elimination, of_head, of_frame, index, views.frame)
     by_head = np.swapaxes(of_head, -1, -2) @ squared  # [V, n + 8, n + 9]
     by_frame = np.swapaxes(of_frame, -1, -2) @ squared[:, n : n + 6]  # [V, 6, n + 9]
-    index = _head_index(views, cameras, n)
     size = state.head_size
     head, gradient = np.zeros((size, size)), np.zeros(size)
     frames, cross = np.zeros((views.frames, 6, 6)), np.zeros((views.frames, 6, size))
@@ -223,7 +252,7 @@ def normal_equations(
     six = np.arange(6)[:, None]
     np.add.at(cross, (views.frame[:, None, None], six, index[:, None, :]), by_frame @ of_head)
     np.add.at(frame_gradient, views.frame, by_frame[..., -1])
-    return NormalEquations(head, frames, cross, gradient, frame_gradient)
+    return NormalEquations(head, frames, cross, gradient, frame_gradient, moving)
 
 
 def _adjoints(views: BoardViews, state: RigState) -> tuple[np.ndarray, np.ndarray]:
@@ -240,6 +269,10 @@ def _adjoints(views: BoardViews, state: RigState) -> tuple[np.ndarray, np.ndarra
     head[:, n + 3 : n + 6, n : n + 3] = -cross_matrix(lever)
     frame = np.zeros((len(views), 6, 6))
     frame[:, :3, :3] = frame[:, 3:, 3:] = rotation
+    if state.motion:
+        turns = state.motion.turns(views)
+        head[:, n : n + 3, n : n + 3] = turns
+        frame[:, :3, :3] = turns @ rotation
     return head, frame
 
 

@@ -10,7 +10,7 @@ standard error of the difference to the best, over frames), the one with the few
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,9 +18,9 @@ from preface.capture.calibration.adjustment import Adjusted, minimise
 from preface.capture.calibration.covariance import uncertainty
 from preface.capture.calibration.determined import FOCAL_TOLERANCE
 from preface.capture.calibration.errors import CalibrationError
+from preface.capture.calibration.folding import folding, held_names, unfolded
 from preface.capture.calibration.state import RigState, free_head
 from preface.capture.calibration.views import BoardViews
-from preface.geometry.cameras import Camera
 
 CRITERION = (
     "fewest parameters among the candidates whose held-out error is within one standard error of the best "
@@ -44,6 +44,7 @@ class Candidate:
         standard_error: of `excess`; or None.
         refused: why the candidate cannot be chosen; empty if it can.
         chosen: whether it was.
+        held: coefficients held at zero, as the lens would fold inside its image with them.
     """
 
     camera_model: str
@@ -55,6 +56,7 @@ class Candidate:
     standard_error: float | None
     refused: str
     chosen: bool
+    held: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +64,7 @@ class _Tried:
     model: str
     warp: bool
     solution: Adjusted
+    free: np.ndarray
     training_rms: float
     refused: str
     by_frame: np.ndarray  # mean squared held-out error per frame, NaN where it has none; empty if refused
@@ -69,7 +72,7 @@ class _Tried:
 
     @property
     def parameters(self) -> int:
-        return self.solution.state.params.size + 2 * self.warp
+        return int(self.free[: self.solution.state.params.size].sum()) + 2 * self.warp
 
 
 def select_model(
@@ -80,7 +83,7 @@ def select_model(
     folds: int,
     camera_ids: tuple[str, ...],
     image_sizes: tuple[tuple[int, int], ...],
-) -> tuple[tuple[Candidate, ...], RigState, bool]:
+) -> tuple[tuple[Candidate, ...], RigState, np.ndarray]:
     """Choose among camera models and board shapes.
 
     Args:
@@ -91,7 +94,7 @@ def select_model(
         camera_ids, image_sizes: of the cameras.
 
     Returns:
-        the table, simplest first; the chosen candidate's solution over all frames; whether it warps the board.
+        the table, simplest first; the chosen candidate's solution over all frames, and what is free in it, [Nh].
 
     Raises:
         CalibrationError: too few frames, or the sightings determine no candidate.
@@ -127,10 +130,11 @@ def select_model(
             None if candidate.refused else _excess(candidate, best)[1],
             candidate.refused,
             candidate is chosen,
+            held_names(candidate.solution.state, candidate.free, camera_ids),
         )
         for candidate in tried
     )
-    return table, chosen.solution.state, chosen.warp
+    return table, chosen.solution.state, chosen.free
 
 
 def held_out(
@@ -159,21 +163,21 @@ def _try(
 ) -> _Tried:
     start = flexible.state.as_model(model)
     if not warp:
-        start = RigState(model, start.params, start.camera_from_rig, start.rig_from_board, np.zeros(2))
+        start = replace(start, warp=np.zeros(2))
     free = free_head(start, warp=warp)
     state, residual = minimise(views, start, flexible.used, free, tolerance=1e-6, iterations=20)
-    solution = Adjusted(state, flexible.used, residual)
-    training = float(np.sqrt((residual[flexible.used] ** 2).sum(axis=-1).mean()))
+    solution, free = unfolded(views, Adjusted(state, flexible.used, residual), free, image_sizes)
+    training = float(np.sqrt((solution.residuals[flexible.used] ** 2).sum(axis=-1).mean()))
     refused = _refusal(views, solution, free, camera_ids, image_sizes)
     if refused:
-        return _Tried(model, warp, solution, training, refused, np.empty(0), None)
+        return _Tried(model, warp, solution, free, training, refused, np.empty(0), None)
     squared = (held_out(views, solution, free, parts) ** 2).sum(axis=-1)
     counted = np.isfinite(squared)
     total = np.bincount(views.frame, np.where(counted, squared, 0).sum(axis=1), views.frames)
     count = np.bincount(views.frame, counted.sum(axis=1), views.frames)
     by_frame = np.divide(total, count, out=np.full(views.frames, np.nan), where=count > 0)
     rms = float(np.sqrt(total.sum() / count.sum()))
-    return _Tried(model, warp, solution, training, refused, by_frame, rms)
+    return _Tried(model, warp, solution, free, training, refused, by_frame, rms)
 
 
 def _refusal(
@@ -193,10 +197,8 @@ def _refusal(
     worst = int(np.argmax(deviation))
     if deviation[worst] > FOCAL_TOLERANCE:
         return f"focal length of camera '{camera_ids[worst]}' is only known to {deviation[worst]:.1%}"
-    for name, size, params in zip(camera_ids, image_sizes, state.params, strict=True):
-        if Camera(state.model, *size, params).folds_inside_image():
-            return f"the lens of camera '{name}' would fold inside its image"
-    return ""
+    folded = folding(state, image_sizes)
+    return f"the lens of camera '{camera_ids[folded[0]]}' would fold inside its image" if folded else ""
 
 
 def _excess(candidate: _Tried, best: _Tried) -> tuple[float, float]:

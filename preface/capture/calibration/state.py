@@ -3,6 +3,8 @@
     head = (parameters of camera 0, of camera 1, ...; poses of camera 0, 1, ...; the two warp parameters)
     tail = (pose of the board in frame 0, 1, ...)
 
+and, where cameras are not simultaneous, how far the board had moved in each view (see `motion`).
+
 A pose has six: a rotation vector (radians) about the axes of the target frame, then the translation
 (metres): R <- Exp(w) R, t <- t + d.
 """
@@ -13,8 +15,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from preface.capture.calibration.motion import Motion, turned
 from preface.capture.calibration.views import BoardViews
 from preface.geometry.cameras import CAMERA_MODELS, Camera
 from preface.geometry.transforms import Rigid
@@ -41,6 +43,7 @@ class RigState:
         camera_from_rig: C poses.
         rig_from_board: F poses, of the board about its middle (see `BoardViews`).
         warp: [2] metres, how far the board's middle line bows along x and along y.
+        motion: of the board between the views of a frame; None where cameras are simultaneous.
     """
 
     model: str
@@ -48,6 +51,7 @@ class RigState:
     camera_from_rig: Rigid
     rig_from_board: Rigid
     warp: np.ndarray
+    motion: Motion | None = None
 
     @property
     def intrinsics(self) -> np.ndarray:
@@ -88,13 +92,18 @@ class RigState:
         return replace(
             self,
             params=self.params + head[: cameras * n].reshape(cameras, n),
-            camera_from_rig=_turned(self.camera_from_rig, poses),
-            rig_from_board=_turned(self.rig_from_board, tail),
+            camera_from_rig=turned(self.camera_from_rig, poses),
+            rig_from_board=turned(self.rig_from_board, tail),
             warp=self.warp + head[-2:],
         )
 
     def camera_from_board(self, views: BoardViews) -> Rigid:
         """The board's pose in each view, V poses."""
+        rigid = self.camera_from_board_at_rest(views)
+        return rigid if self.motion is None else self.motion.apply(views, rigid)
+
+    def camera_from_board_at_rest(self, views: BoardViews) -> Rigid:
+        """The pose in each view [V] that its frame gives the board, motion apart."""
         camera = Rigid(
             self.camera_from_rig.rotation[views.camera], self.camera_from_rig.translation[views.camera]
         )
@@ -117,8 +126,3 @@ def free_head(
     params = np.array([name not in fixed for name in CAMERA_MODELS[state.model]])
     pose = np.repeat(np.arange(cameras) > 0, 6) & poses
     return np.concatenate([np.tile(params, cameras), pose, (warp, warp)])
-
-
-def _turned(poses: Rigid, step: np.ndarray) -> Rigid:
-    turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
-    return Rigid(turn @ poses.rotation, poses.translation + step[:, 3:])

@@ -116,16 +116,95 @@ def test_half_of_the_corners_may_be_wrong():
     assert np.abs(params_in_sigmas(scene, found)).max() < 4.5
 
 
-def test_a_rig_that_is_not_simultaneous_is_told_from_a_good_one():
-    scene, good = solved()
-    assert good.sigma_alone == pytest.approx(scene.config.noise, rel=0.2)
-    assert not good.warnings
-    # Each camera is late by its own bit: its boards are a few pixels off, each view as a whole.
-    seen = scene.observations
-    rng = np.random.default_rng(0)
-    late = rng.normal(size=(4, 12, 2))[seen.camera, seen.frame]
-    found = calibrate_rig(replace(seen, pixels=seen.pixels + 2 * late), PLAIN)
+WAVED = SceneConfig(
+    cameras=4,
+    frames=40,
+    width=1280,
+    height=720,
+    focal=900,
+    columns=4,
+    rows=5,
+    spacing=0.05,
+    noise=0.05,
+    lag=0.04,
+)
+
+
+def test_a_rig_that_is_triggered_together_shows_no_motion():
+    scene, found = solved()
+    assert found.sigma_alone == pytest.approx(scene.config.noise, rel=0.05)
+    assert found.motion is None
+    assert not found.warnings
+    assert np.array_equal(found.residuals, found.residuals_at_rest, equal_nan=True)
+
+
+def test_cameras_that_are_not_simultaneous_are_calibrated_all_the_same():
+    scene, found = solved(WAVED)
     assert "same instant" in found.warnings[0]
+    assert found.motion is not None
+    turn, shift = found.motion
+    # Speeds are spread evenly up to their maximum, along three axes.
+    assert shift == pytest.approx(WAVED.lag * WAVED.speed / 3, rel=0.4)
+    assert turn == pytest.approx(WAVED.lag * WAVED.spin / 3, rel=0.4)
+    assert found.uncertainty.sigma == pytest.approx(WAVED.noise, rel=0.1)
+    assert found.reprojection_rms == pytest.approx(WAVED.noise * np.sqrt(2), rel=0.1)
+    assert found.reprojection_rms_at_rest > 5 * found.reprojection_rms
+    assert np.abs(params_in_sigmas(scene, found)).max() < 4.5
+    shift = found.camera_from_rig.translation - scene.camera_from_rig.translation
+    assert (np.abs(shift[1:]) < 4.5 * found.uncertainty.standard_deviations[2][1:]).all()
+
+
+def test_motion_within_frames_is_written_with_the_rig():
+    _, found = solved(WAVED)
+    motion = found.rig("take-1").metadata["motion_within_frames"]
+    assert (motion["rotation"], motion["translation"]) == found.motion
+    assert motion["reprojection_rms_at_rest"] == found.reprojection_rms_at_rest
+
+
+def test_a_lens_that_would_fold_in_unseen_corners_loses_a_coefficient():
+    config = SceneConfig(
+        cameras=3,
+        frames=24,
+        azimuth=30,
+        width=1280,
+        height=720,
+        focal=700,
+        columns=4,
+        rows=5,
+        spacing=0.03,
+        noise=0.1,
+        distortion=(0.05, 0, 0, 0),
+        distance=0.9,
+        tilt=45,
+    )
+    scene = simulate(config, 0)
+    seen = scene.observations
+    in_the_middle = np.linalg.norm(seen.pixels - np.array((640, 360)), axis=1) < 230
+    found = calibrate_rig(seen.subset(in_the_middle), PLAIN)
+    assert not any(camera.folds_inside_image() for camera in found.cameras)
+    held = np.array([camera.params[5] == 0 for camera in found.cameras])
+    assert held.tolist() == [False, True, False]
+    assert np.array_equal(found.uncertainty.standard_deviations[0][:, 5] == 0, held)
+    focal = np.stack([camera.params[:2] for camera in scene.cameras])
+    error = np.stack([camera.params[:2] for camera in found.cameras]) - focal
+    assert (np.abs(error) < 4 * found.uncertainty.standard_deviations[0][:, :2]).all()
+
+
+def test_a_calibration_that_starts_from_another_take_gives_the_same_rig():
+    scene, cold = solved()
+    warm = calibrate_rig(scene.observations, PLAIN, cold)
+    sigmas = cold.uncertainty.standard_deviations[0]
+    for one, other, sigma in zip(cold.cameras, warm.cameras, sigmas, strict=True):
+        assert (np.abs(one.params - other.params) < 0.02 * sigma).all()
+
+
+def test_lenses_of_another_take_are_dropped_where_they_contradict():
+    scene, cold = solved()
+    zoomed = tuple(
+        replace(camera, params=camera.params * np.array([2, 2, 1, 1, 1, 1, 1, 1])) for camera in cold.cameras
+    )
+    warm = calibrate_rig(scene.observations, PLAIN, replace(cold, cameras=zoomed))
+    assert np.abs(params_in_sigmas(scene, warm)).max() < 4
 
 
 def test_unknown_model_is_refused():

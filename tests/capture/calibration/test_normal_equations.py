@@ -1,11 +1,14 @@
 """The fast normal equations against the obvious ones: numerical derivatives, stacked row by row."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bench.calibration_scene import SceneConfig, simulate
+from preface.capture.calibration.motion import Motion, turned
 from preface.capture.calibration.normal_equations import linearise, normal_equations, residuals
-from preface.capture.calibration.state import RigState, expansion
+from preface.capture.calibration.state import RigState, expansion, free_head
 from preface.capture.calibration.views import BoardViews, stack_views
 from preface.geometry import CAMERA_MODELS, Rigid, lens
 
@@ -108,3 +111,47 @@ def test_undamped_step_solves_the_whole_system():
         -equations.head_gradient,
         atol=1e-6 * np.abs(equations.head_gradient).max(),
     )
+
+
+def test_steps_with_a_board_that_moves_in_each_view_are_those_of_the_whole_dense_problem():
+    views, state = problem("OPENCV")
+    rng = np.random.default_rng(1)
+    rest = state.camera_from_board_at_rest(views)
+    offsets = rng.normal(size=(len(views), 6)) * np.repeat((2e-3, 1e-3), 3)
+    motion = Motion.between(views, rest, turned(rest, offsets))
+    motion = motion.weighed(views, np.ones(len(views), bool), sigma=0.3)
+    state = replace(state, motion=motion)
+    free = free_head(state, warp=True)
+    residual, rows = linearise(views, state)
+    equations = normal_equations(views, state, rows, views.seen.astype(float))
+    head, tail, ahead = equations.restricted(free).step(0.0)
+    whole = np.zeros(state.head_size)
+    whole[free] = head
+    by_view = equations.view_step(whole, tail)
+
+    used = np.bincount(views.frame, minlength=views.frames) > 0
+    rigid = numerical_jacobian(views, state)[views.seen].reshape(-1, state.head_size + 6 * views.frames)
+    columns = []
+    for index in range(6 * len(views)):
+        step = np.zeros(6 * len(views))
+        step[index] = 1e-6
+        there = [
+            residuals(views, replace(state, motion=motion.moved(views, s.reshape(-1, 6))))
+            for s in (step, -step)
+        ]
+        columns.append(((there[0] - there[1]) / 2e-6)[views.seen].ravel())
+    keep = np.concatenate([free, np.repeat(used, 6)])
+    prior = np.sqrt(motion.weights(views)).ravel()
+    dense = np.block(
+        [
+            [rigid[:, keep], np.stack(columns, axis=-1)],
+            [np.zeros((len(prior), keep.sum())), np.diag(prior)],
+        ]
+    )
+    right = np.concatenate([residual[views.seen].ravel(), prior * motion.steps(views).ravel()])
+    scale = 1 / np.linalg.norm(dense, axis=0)
+    expected = -scale * np.linalg.lstsq(dense * scale, right, rcond=None)[0]
+    found = np.concatenate([head, tail[used].ravel(), by_view.ravel()])
+    np.testing.assert_allclose(found / scale, expected / scale, atol=2e-4 * np.abs(expected / scale).max())
+    gained = (right**2).sum() - ((right + dense @ found) ** 2).sum()
+    assert 2 * ahead == pytest.approx(gained, rel=1e-4)
