@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# The project at work on a bare machine: sets up, makes a small synthetic studio, checks it and shows it.
+# The project at work on a bare machine: sets up, makes a small synthetic studio, checks it, calibrates its
+# cameras from its pictures of a board, and shows it.
 # Every step prints the command that it runs. Run again, it resumes where it stopped. Prints the path of
 # the page that shows the results last.
 #   OUTPUT=DIR   where to put everything (default: demo_output)
@@ -21,8 +22,12 @@ stage() { # stage NAME command...: prints and times the command
 }
 
 stage "synthetic studio" $bin/python tools/synthetic_studio --output "$studio" \
-    --identities 4 --views 13 --resolution 256x384 --board.frames 4
+    --identities 4 --views 13 --resolution 256x384 --board.frames 14
 stage inspection $bin/preface-inspect "$studio/capture"
+stage calibration $bin/preface-calibrate board "$studio/capture" --output "$studio"
+stage "inspection of the rigs" $bin/preface-inspect "$studio"/rigs/take??.json
 stage page $bin/python tools/show_studio.py "$studio" --took "${took[@]}"
 
-printf '\nOpen this page: %s\n' "$(cd "$studio" && pwd)/report.html"
+here=$(cd "$studio" && pwd)
+printf '\nReports, one per stage: %s\n' "$here"/rigs/take??.report.html
+printf '\nOpen this page: %s\n' "$here/report.html"

@@ -16,7 +16,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -24,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from preface.geometry import Camera, Rigid
 from synthetic_studio.facemesh import detect, look_at
 from synthetic_studio.heads import Head, build_head
+from synthetic_studio.raycasting import raycasting_scene
 from synthetic_studio.regions import head_regions
 from synthetic_studio.render import HeadRenderer
 from synthetic_studio.sensor import encode_srgb
@@ -75,8 +75,7 @@ def _cast_back(head: Head, camera_from_studio: Rigid, pixels: np.ndarray) -> np.
     xy, _ = CAMERA.unproject(pixels)
     directions = np.c_[xy, np.ones(len(xy))] @ camera_from_studio.rotation
     origin = np.broadcast_to(camera_from_studio.inverse.translation, directions.shape)
-    skin = o3d.t.geometry.RaycastingScene(nthreads=1)
-    skin.add_triangles(head.surface.vertices.astype(np.float32), head.surface.triangles.astype(np.uint32))
+    skin = raycasting_scene([(head.surface.vertices, head.surface.triangles)])
     hit = skin.cast_rays(np.concatenate([origin, directions], axis=1).astype(np.float32), nthreads=1)
     found = np.isfinite(hit["t_hit"].numpy())
     uv = hit["primitive_uvs"].numpy()
@@ -87,10 +86,7 @@ def _cast_back(head: Head, camera_from_studio: Rigid, pixels: np.ndarray) -> np.
 
 
 def _closest_on_average(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        head_regions().position.astype(np.float32), head_template().triangles.astype(np.uint32)
-    )
+    scene = raycasting_scene([(head_regions().position, head_template().triangles)])
     answer = scene.compute_closest_points(position.astype(np.float32))
     uv = answer["primitive_uvs"].numpy().astype(np.float64)
     return answer["primitive_ids"].numpy().astype(np.int64), np.stack(

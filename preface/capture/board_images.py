@@ -7,15 +7,15 @@ import numpy as np
 
 from preface.capture.calibration_files import CalibrationTake, is_video
 from preface.capture.corners import Corners
-from preface.capture.images import read_image
+from preface.capture.images import displayable, read_image
 from preface.capture.video import assign_cameras, frames_of_video, read_frames, read_timestamps
 
 
 def image_loader(take: CalibrationTake, corners: Corners) -> Callable[[str, str], np.ndarray | None]:
     """A function from (camera id, frame id) to the image in which `corners` has them.
 
-    It returns uint8 or uint16 [height, width] or [height, width, 3], or None where the corners do not name a
-    file, or one that is no more. It raises ArtifactError for a file that cannot be read.
+    It returns uint8 [height, width, 3] as one looks at it, or None where the corners do not name a file, or one
+    that is no more. It raises ArtifactError for a file that cannot be read.
     """
 
     def load(camera: str, frame: str) -> np.ndarray | None:
@@ -26,8 +26,7 @@ def image_loader(take: CalibrationTake, corners: Corners) -> Callable[[str, str]
         if is_video((path,)):
             index = _frame_index(take, camera, frame)
             return None if index is None else next((image for _, image in read_frames(path, [index])), None)
-        image = read_image(path)
-        return _shown(image)
+        return displayable(read_image(path))
 
     return load
 
@@ -43,12 +42,3 @@ def _frame_index(take: CalibrationTake, camera: str, frame: str) -> int | None:
     numbers = assign_cameras(times, list(videos))
     by_index = frames_of_video(times, numbers[camera], videos[camera])
     return next((index for index, sync in by_index.items() if sync == int(frame)), None)
-
-
-def _shown(image: np.ndarray) -> np.ndarray:
-    """An image as a page shows it: three channels at most, linear light encoded."""
-    image = image[..., :3] if image.ndim == 3 else image
-    if np.issubdtype(image.dtype, np.floating):
-        bright = max(float(np.nanpercentile(image, 99.5)), 1e-9)
-        image = np.clip(np.nan_to_num(image) / bright, 0, 1) ** (1 / 2.2)
-    return image

@@ -21,6 +21,8 @@ LARGEST_PANEL = 3.6  # inches wide
 CELLS = 14  # of a residual field along the image's longer side
 MIN_IN_CELL = 3  # sightings; the mean of fewer is noise
 MAX_FRAME_TICKS = 50
+MAX_POINTS = 4000  # of a cloud; more make a page heavy and show nothing new
+NAME_DISTANCE = 0.05  # of the plot's height, between names that stay legible
 INK, SOFT, ACCENT, EMPTY = "#1c1e21", "#8a9199", "#0b62c4", "#e4e7ea"
 
 
@@ -173,6 +175,58 @@ def rig_view(
     space.view_init(elev=22, azim=60)
     space.tick_params(labelsize=6)
     return figure
+
+
+def photographs_in_space(
+    names: Sequence[str], cameras: Sequence[Camera], camera_from_rig: Rigid, points: np.ndarray, unit: str
+) -> Figure:
+    """Where photographs were taken from, from above and from the side, and the points that they see.
+
+    Args:
+        names, cameras: C of them; names that would cover others are left out.
+        camera_from_rig: C poses.
+        points: [N, 3] in the rig's frame.
+        unit: of length, for the axes.
+    """
+    middle = np.median(points, axis=0)
+    upright = _upright(camera_from_rig, middle)
+    centers = (camera_from_rig.inverse.translation - middle) @ upright.T
+    cloud = (points[:: -(-len(points) // MAX_POINTS)] - middle) @ upright.T
+    reach = 0.1 * float(np.median(np.linalg.norm(centers, axis=1)))
+    figure = new_figure(PAGE_WIDTH, 5.4, columns=2)
+    labels = (f"right ({unit})", f"towards the cameras ({unit})", f"up ({unit})")
+    for axis, (across, along), title in zip(
+        figure.axes, ((0, 1), (1, 2)), ("from above", "from the side"), strict=True
+    ):
+        axis.plot(cloud[:, across], cloud[:, along], ".", color=SOFT, markersize=1.5, alpha=0.5)
+        for index, camera in enumerate(cameras):
+            rays = _corner_rays(camera) * reach - camera_from_rig.translation[index]
+            corners = (rays @ camera_from_rig.rotation[index] - middle) @ upright.T
+            for line in (
+                corners[[0, 1, 2, 3, 0]],
+                *(np.stack([centers[index], corner]) for corner in corners),
+            ):
+                axis.plot(line[:, across], line[:, along], color=ACCENT, linewidth=0.6)
+        axis.plot(centers[:, across], centers[:, along], "o", color=ACCENT, markersize=3)
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.set(xlabel=labels[across], ylabel=labels[along], title=title)
+        shown = np.concatenate([cloud, centers])[:, along]
+        for index in _apart(centers[:, (across, along)], NAME_DISTANCE * float(np.ptp(shown))):
+            place = (centers[index, across], centers[index, along])
+            axis.annotate(
+                names[index], place, fontsize=7, color=INK, xytext=(4, 3), textcoords="offset points"
+            )
+    return figure
+
+
+def _apart(places: np.ndarray, distance: float) -> list[int]:
+    """Of places [N, 2], the first, and each further one that lies this far up or down, or thrice to the side."""
+    kept: list[int] = []
+    for index, place in enumerate(places):
+        off = np.abs(places[kept] - place) / (3 * distance, distance)
+        if (off.max(axis=1) >= 1).all():
+            kept.append(index)
+    return kept
 
 
 @dataclass(frozen=True)

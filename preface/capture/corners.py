@@ -36,7 +36,7 @@ class Corners:
         take: its id.
         observations: what was seen; board points in metres.
         board: the board's description, where the detector knew it.
-        files: (camera id, frame id) to the image, or the video, relative to the capture.
+        files: (camera id, frame id) to the image, or the video, relative to the folder of the take's cameras.
         unseen: images without a corner.
         warnings: what the user should know, whole sentences.
     """

@@ -129,7 +129,10 @@ def _other_squares(board: Board, found: Sequence[_Markers]) -> str | None:
 
 
 def _boards_up_to(board: Board, highest: int) -> Iterator[Board]:
-    """Boards just large enough for an id, the described one's kin first."""
+    """The described board in either pattern, then boards just large enough for an id, its kin first."""
+    if board.type == "charuco":
+        # A board of one row more may fit as well: the pattern's other kind is the smaller mistake.
+        yield from (board, replace(board, legacy=not board.legacy))
     widths = sorted(range(2, 41), key=lambda columns: abs(columns - board.squares[0]))
     for legacy in (board.legacy, not board.legacy) if board.type == "charuco" else (board.legacy,):
         for columns in widths:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from preface.capture.boards import board_points, marker_corners, marker_dictionary
+from preface.capture.images import display_tones, light_of_levels
 from preface.capture.manifest import Board
 from preface.capture.subpixel import Junction, Refined, Surroundings, refine
 from preface.geometry.conventions import pixels_from_opencv
@@ -52,7 +53,7 @@ class Picture:
 
     Attributes:
         shown: uint8 [height, width], as encoded; inverted where the board is printed white on black.
-        light: float32 [height, width], proportional to light.
+        light: float32 [height, width], proportional to light; not finite where the image is not.
     """
 
     shown: np.ndarray
@@ -63,15 +64,10 @@ class Picture:
         """From an image as `read_image` returns it: [height, width] or with channels, integers are sRGB."""
         grey = _grey(image)
         if np.issubdtype(grey.dtype, np.integer):
-            top = np.iinfo(grey.dtype).max
-            encoded = np.arange(top + 1, dtype=np.float32) / top
-            table = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-            light = table.astype(np.float32)[grey]
-            shown = grey if grey.dtype == np.uint8 else (grey >> 8).astype(np.uint8)
+            light = light_of_levels(grey.dtype)[grey]
         else:
-            light = np.nan_to_num(grey.astype(np.float32), posinf=65504.0, neginf=0.0)
-            bright = max(float(np.percentile(light, 99.5)), 1e-9)
-            shown = np.rint(255 * np.clip(light / bright, 0, 1) ** (1 / 2.2)).astype(np.uint8)
+            light = grey.astype(np.float32)
+        shown = display_tones(grey)
         return cls(255 - shown if inverted else shown, light)
 
 

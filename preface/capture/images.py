@@ -15,6 +15,7 @@ import os
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from PIL.ImageFile import ImageFile
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
+DISPLAY_WHITE = 99.5  # percentile of linear light that is shown as white; lamps and glints may be brighter
+DISPLAY_GAMMA = 2.2  # linear light is shown to this power's inverse: an even spread of tones
 MAX_PIXELS = 2**28  # 268 megapixels: ten times 4096x6144, more than any camera on the market
 EXR_MAGIC = b"\x76\x2f\x31\x01"
 _EXIF_ORIENTATION = 0x0112
@@ -192,6 +195,57 @@ def write_exr(path: str | os.PathLike[str], channels: Mapping[str, np.ndarray]) 
     with OpenEXR.File(header, {n: np.ascontiguousarray(p) for n, p in channels.items()}) as file:
         file.write(stream)
     return write_bytes(path, stream.getvalue())
+
+
+# ------------------------------------------------------------------------------------------ tones
+
+
+def displayable(pixels: np.ndarray) -> np.ndarray:
+    """What a person or a detector looks at: an image of any kind as 8-bit RGB.
+
+    Args:
+        pixels: [height, width] or [height, width, 1, 3 or 4], as `read_image` returns it; alpha is left out.
+
+    Returns:
+        [height, width, 3] uint8, toned by `display_tones`.
+    """
+    colour = pixels[..., None] if pixels.ndim == 2 else pixels[..., :3]
+    tones = display_tones(colour)
+    return np.repeat(tones, 3, axis=2) if tones.shape[2] == 1 else np.ascontiguousarray(tones)
+
+
+def display_tones(pixels: np.ndarray) -> np.ndarray:
+    """The same array in 8 bits, as shown: integers keep their encoding, floats are linear light.
+
+    Light is scaled to the image's own brightness. Values that are no number, such as a renderer's empty
+    pixels, show as black, and infinite ones as the white or black that they overflowed.
+
+    Args:
+        pixels: uint8, uint16 or floats, of any shape.
+
+    Returns:
+        uint8 of that shape.
+    """
+    if pixels.dtype == np.uint8:
+        return pixels
+    if pixels.dtype == np.uint16:
+        return (pixels >> 8).astype(np.uint8)  # right for 8 bits widened by 256 and by 257 alike
+    light = pixels.astype(np.float32)
+    finite = np.isfinite(light)
+    white = float(np.percentile(light[finite], DISPLAY_WHITE)) if finite.any() else 1.0
+    share = np.where(np.isnan(light), np.float32(0), light) / np.float32(max(white, 1e-9))
+    return np.rint(255 * np.clip(share, 0, 1) ** (1 / DISPLAY_GAMMA)).astype(np.uint8)
+
+
+@cache
+def light_of_levels(dtype: np.dtype) -> np.ndarray:
+    """The linear light, float32 in [0, 1], of every sRGB level of an unsigned integer type (IEC 61966-2-1)."""
+    top = np.iinfo(dtype).max
+    encoded = np.arange(top + 1, dtype=np.float32) / top
+    curve = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    light = curve.astype(np.float32)
+    light.setflags(write=False)
+    return light
 
 
 # ---------------------------------------------------------------------------------------- headers

@@ -5,8 +5,8 @@ import numpy as np
 from preface.capture.calibration_figures import (
     CameraResiduals,
     coverage_maps,
+    photographs_in_space,
     residual_fields,
-    rig_view,
 )
 from preface.capture.photos import PhotoCalibration
 from preface.geometry import lens
@@ -14,6 +14,7 @@ from preface.geometry.cameras import stack_intrinsics
 from preface.reports import KeyFigure, Report
 
 MAX_LISTED = 40  # photographs
+OUTLYING = 95  # percentile of the points' distances from their middle; further ones would shrink the others
 MAX_ERROR = 4.0  # pixels; sightings further off are mismatches, and would hide the field of the others
 
 
@@ -28,7 +29,7 @@ def photo_report(found: PhotoCalibration) -> Report:
 
 
 def _summary(report: Report, found: PhotoCalibration) -> None:
-    section = report.section("Summary", "\n\n".join(found.warnings))
+    section = report.section("Summary", "\n\n".join(map(_sentence, found.warnings)))
     chosen, count = found.candidates[found.chosen], len(found.rig.cameras)
     section.key_figures(
         [
@@ -40,6 +41,10 @@ def _summary(report: Report, found: PhotoCalibration) -> None:
         ]
     )
     section.text(f"Scale: {found.scale}.")
+
+
+def _sentence(words: str) -> str:
+    return f"{words[:1].upper()}{words[1:]}."
 
 
 def _models(report: Report, found: PhotoCalibration) -> None:
@@ -89,17 +94,20 @@ def _photographs(report: Report, found: PhotoCalibration) -> None:
         section.table(missing, "Not registered")
     structure = found.structure
     points = structure.points[np.unique(found.tracks.point)]
-    near = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    box = points[near <= np.percentile(near, 80)]
-    low, high = box.min(axis=0), box.max(axis=0)
-    corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
-    faces = np.array([[(x, y, z) for x, y in corners] for z in (low[2], high[2])])
+    distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     cameras = [structure.cameras[index] for index in found.tracks.camera_of_image]
     section.plot(
-        rig_view(list(found.rig.cameras), cameras, structure.camera_from_world, faces),
-        "Where the photographs were taken from; grey: a box about most of the points.",
+        photographs_in_space(
+            list(found.rig.cameras),
+            cameras,
+            structure.camera_from_world,
+            points[distance <= np.percentile(distance, OUTLYING)],
+            "arbitrary unit" if found.scale.startswith("arbitrary") else "m",
+        ),
+        f"Where the photographs were taken from; grey: the nearest {OUTLYING}% of the points. Names that would "
+        "cover others are left out.",
         "Positions of the cameras",
-        "svg",
+        "png",
     )
 
 

@@ -77,7 +77,8 @@ def refine(grey: np.ndarray, start: np.ndarray, axes: np.ndarray, around: Surrou
     """Move corners to where the image has them.
 
     Args:
-        grey: [height, width] of any numeric type, best proportional to light.
+        grey: [height, width] of any numeric type, best proportional to light. Values that are not finite
+            do not count.
         start: [N, 2] pixels with OpenCV's origin, at most about two pixels off.
         axes: [N, 2, 2] the image of one square's edges at each corner: axes[n, 0] along the board's x, axes[n, 1]
             along its y, in pixels. For a tag they are its edges, from the corner, the second clockwise of
@@ -147,17 +148,18 @@ class _Fit:
         grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         pixels = np.rint(start).astype(int)[:, None] + grid  # [N, P, 2]
         limit = np.array(grey.shape[1::-1])
-        inside = ((pixels >= 0) & (pixels < limit)).all(axis=-1)
         column, row = np.moveaxis(np.clip(pixels, 0, limit - 1), -1, 0)
+        values = grey[row, column].astype(np.float64)
+        known = ((pixels >= 0) & (pixels < limit)).all(axis=-1) & np.isfinite(values)
         offsets = pixels - start[:, None]
         wanted = _window(offsets, axes, around, radius)
-        counted = wanted & inside
+        counted = wanted & known
         enough = (counted.sum(axis=1) >= 0.7 * wanted.sum(axis=1)) & (counted.sum(axis=1) > 18)
         angles = np.arctan2(axes[..., 1], axes[..., 0])
         # Leave out what no corner counts: the windows are narrow crosses.
         order = np.argsort(~counted, axis=1, kind="stable")[:, : max(counted.sum(axis=1).max(), 1)]
         offsets = np.take_along_axis(offsets, order[..., None], axis=1)
-        values = np.take_along_axis(grey[row, column], order, axis=1).astype(np.float64)
+        values = np.take_along_axis(np.where(known, values, 0.0), order, axis=1)
         weights = np.take_along_axis(counted, order, axis=1).astype(np.float64)
         return cls(offsets, values, weights, angles, enough, around.junction)
 

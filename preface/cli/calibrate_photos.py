@@ -9,8 +9,7 @@ from typing import Any
 
 from preface.artifacts import provenance
 from preface.capture.photo_report import photo_report
-from preface.capture.photos import PhotoOptions, calibrate_photos
-from preface.capture.photos.files import find_photographs
+from preface.capture.photos import PhotoCalibration, PhotoOptions, calibrate_photos
 from preface.capture.rig import write_rig
 from preface.cli.usage import UsageError
 
@@ -32,7 +31,7 @@ def run(config: argparse.Namespace) -> list[str]:
     began = time.perf_counter()
     found = calibrate_photos(config.source, options)
     print(f"calibrated in {time.perf_counter() - began:.1f} s", file=sys.stderr)
-    history = provenance(_plain(asdict(options)), _inputs(config.source, options), config.seed)
+    history = provenance(_plain(asdict(options)), _inputs(config.source, found), config.seed)
     rig = replace(found.rig, provenance=history)
     for warning in found.warnings:
         print(f"note: {warning}", file=sys.stderr)
@@ -58,10 +57,9 @@ def _known_distance(words: list[str] | None) -> tuple[str, str, float] | None:
         raise UsageError(f"--known-distance: '{metres}' is not a length in metres") from error
 
 
-def _inputs(source: Path, options: PhotoOptions) -> dict[str, Path]:
+def _inputs(source: Path, found: PhotoCalibration) -> dict[str, Path]:
     return {
-        photograph.path.relative_to(source).as_posix(): photograph.path
-        for photograph in find_photographs(source, options.cameras)
+        photograph.path.relative_to(source).as_posix(): photograph.path for photograph in found.photographs
     }
 
 

@@ -15,6 +15,9 @@ from preface.capture.images import (
     MAX_PIXELS,
     ImageError,
     ImageHeader,
+    display_tones,
+    displayable,
+    light_of_levels,
     read_exr,
     read_header,
     read_image,
@@ -286,3 +289,50 @@ def test_a_missing_folder_is_named_with_the_remedy(tmp_path):
         ArtifactError, match=r"gone/a\.png: writing: no such file or directory\. Correct the path"
     ):
         write_png(tmp_path / "gone" / "a.png", pixels(np.uint8, 3))
+
+
+# ------------------------------------------------------------------------------------------ tones
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float16, np.float32])
+@pytest.mark.parametrize("channels", [None, 1, 3, 4])
+def test_any_kind_of_image_is_shown_as_8_bit_rgb(dtype, channels):
+    image = np.ones((5, 7) if channels is None else (5, 7, channels), dtype)
+    shown = displayable(image)
+    assert (shown.shape, shown.dtype) == ((5, 7, 3), np.uint8)
+    assert shown.flags.c_contiguous
+
+
+def test_eight_bits_are_shown_as_they_are_and_as_they_were_before_widening():
+    image = pixels(np.uint8, 3)
+    np.testing.assert_array_equal(displayable(image), image)
+    for factor in (256, 257):
+        np.testing.assert_array_equal(displayable(image.astype(np.uint16) * factor), image)
+
+
+def test_linear_light_is_shown_the_same_whatever_its_unit():
+    light = np.random.default_rng(0).uniform(0, 1, (40, 50, 3)).astype(np.float32)
+    shown = displayable(light)
+    assert shown.max() == 255
+    np.testing.assert_allclose(displayable(light * 1024).astype(int), shown, atol=1)
+    # Half the light of white is 186 at a gamma of 2.2.
+    assert abs(int(display_tones(np.array([1.0] * 9 + [0.5]))[-1]) - 186) <= 1
+
+
+def test_what_is_no_number_shows_black_and_dims_nothing():
+    light = np.full((20, 20), 0.5, np.float32)
+    light[0, :4] = np.nan, np.inf, -np.inf, -1
+    shown = displayable(light)[..., 0]
+    assert shown[0, :4].tolist() == [0, 255, 0, 0]
+    assert (shown[1:] == 255).all()
+    assert (displayable(np.full((3, 3), np.nan, np.float32)) == 0).all()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_light_of_levels_undoes_the_srgb_encoding(dtype):
+    light = light_of_levels(np.dtype(dtype)).astype(np.float64)
+    levels = np.arange(len(light)) / (len(light) - 1)
+    encoded = np.where(
+        light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055
+    )
+    np.testing.assert_allclose(encoded, levels, atol=2e-6)

@@ -1,6 +1,7 @@
 """preface-calibrate as a program: what it writes, what it prints, and how it ends when something is wrong."""
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -344,3 +345,14 @@ def test_photographs_that_are_too_few(tmp_path, capsys):
     pytest.importorskip("pycolmap")
     assert run("photos", tmp_path, "--output", tmp_path / "rig.json") == 1
     assert "Give at least two" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("asked", "expected"), [(None, "1"), ("4", None)])
+def test_blas_keeps_to_one_thread_unless_a_number_was_set(tmp_path, monkeypatch, asked, expected):
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        monkeypatch.setenv(name, "")  # so that it is put back afterwards
+        monkeypatch.delenv(name)
+    if asked:
+        monkeypatch.setenv("OMP_NUM_THREADS", asked)
+    assert run("import", tmp_path / "nothing") == 1
+    assert os.environ.get("OPENBLAS_NUM_THREADS") == expected

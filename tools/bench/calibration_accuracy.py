@@ -2,26 +2,20 @@
 
     python tools/bench/calibration_accuracy.py [--seeds 20] [--only accuracy bow uncertainty peers]
 
-The problem is the reference rig of `calibration_scene`. The bound is the covariance of the normal equations
-at the truth over the sightings that are no outliers, with the true noise. Rigs have no frame of their own:
-the estimate is turned and shifted, but not scaled, so that its camera centres lie nearest to the true ones,
-and the bound is taken under the same condition. Keypoints are triangulated from exact images.
+The problem is the reference rig of `calibration_scene`; errors and their bound are those of `calibration_truth`.
 
   accuracy     20 seeds for each share of outliers and each noise: RMS error over the RMS of the bound
   bow          the same for a board that bulges by 1 mm, its shape solved for, over the flat board's error
   uncertainty  predicted standard deviations over those of a Monte Carlo simulation
-  peers        pycolmap's rig adjustment and, where importable, aniposelib and mrcal, from the same start
+  peers        pycolmap's rig adjustment, aniposelib and mrcal, from the same start (see `calibration_peers`)
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import os
 import sys
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 # At these sizes the threads of the BLAS cost more than they bring, the more so on a busy machine.
@@ -31,51 +25,24 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from bench.calibration_scene import Scene, SceneConfig, exact_pixels, noisy_again, simulate
-from preface.capture.calibration.adjustment import Adjusted, adjust_robustly, least_squares
-from preface.capture.calibration.colmap_backend import adjust_with_colmap
-from preface.capture.calibration.covariance import Uncertainty, points_by_head, uncertainty
-from preface.capture.calibration.initial import calibrate_alone
-from preface.capture.calibration.spanning_tree import assemble
-from preface.capture.calibration.state import RigState, free_head
+from bench.calibration_peers import peers
+from bench.calibration_scene import SceneConfig, exact_pixels, noisy_again
+from bench.calibration_truth import (
+    FIGURES,
+    Problem,
+    Start,
+    bound_squares,
+    problem,
+    solve,
+    squared_errors,
+    start,
+    triangulated,
+)
+from preface.capture.calibration.adjustment import Adjusted, least_squares
+from preface.capture.calibration.covariance import Uncertainty, uncertainty
+from preface.capture.calibration.state import free_head
 from preface.capture.calibration.views import BoardViews, stack_views
-from preface.geometry import Camera, Rigid, fit_similarity, lens
-
-FIGURES = ("camera centre", "focal length", "keypoints")
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """A scene, arranged for the solver."""
-
-    scene: Scene
-    views: BoardViews
-    view_of: np.ndarray
-    warp: bool
-
-    @property
-    def truth(self) -> RigState:
-        """The true state."""
-        boards = self.scene.rig_from_board @ Rigid(np.eye(3), self.views.center)
-        params = np.stack([camera.params for camera in self.scene.cameras])
-        return RigState("OPENCV", params, self.scene.camera_from_rig, boards, np.array(self.scene.config.bow))
-
-    @property
-    def good(self) -> np.ndarray:
-        """Sightings [V, P] that are no outliers."""
-        mask = np.zeros_like(self.views.seen)
-        mask[self.view_of, self.scene.observations.point] = ~self.scene.outlier
-        return mask
-
-
-@dataclass(frozen=True, eq=False)
-class Start:
-    """Where a joint solve starts."""
-
-    views: BoardViews
-    state: RigState
-    trusted: np.ndarray
-    seconds: float
+from preface.geometry import fit_similarity
 
 
 def main() -> None:
@@ -89,86 +56,6 @@ def main() -> None:
     arguments = parser.parse_args()
     for name in arguments.only:
         parts[name](arguments.seeds)
-
-
-def problem(config: SceneConfig, seed: int, warp: bool = False) -> Problem:
-    """Simulate and arrange."""
-    scene = simulate(config, seed)
-    return Problem(scene, *stack_views(scene.observations), warp)
-
-
-def start(given: Problem) -> Start:
-    """Everything before the joint solve."""
-    began = time.perf_counter()
-    seen = given.scene.observations
-    alone = calibrate_alone(given.views, seen.camera_ids, seen.image_sizes)
-    state, trusted = assemble(alone, seen.camera_ids, seen.image_sizes)
-    return Start(alone.views, state.as_model("OPENCV"), trusted, time.perf_counter() - began)
-
-
-def solve(given: Problem, begin: Start) -> tuple[Adjusted, float]:
-    """The joint solve, and its wall time."""
-    began = time.perf_counter()
-    free = free_head(begin.state, warp=given.warp)
-    found = adjust_robustly(begin.views, begin.state, begin.trusted, free)
-    return found, time.perf_counter() - began
-
-
-def bound(given: Problem) -> Uncertainty:
-    """The Cramer-Rao bound over the good sightings, the camera centres held still."""
-    state = given.truth
-    free = free_head(state, warp=given.warp)
-    ids = given.scene.observations.camera_ids
-    return uncertainty(given.views, state, given.good, free, ids, sigma=given.scene.config.noise).under(
-        "cameras"
-    )
-
-
-def bound_squares(given: Problem) -> np.ndarray:
-    """Mean squared errors [3] that the bound allows, in the order of `FIGURES`."""
-    known = bound(given)
-    points = given.scene.keypoints
-    visible = np.ones((len(points), len(given.scene.cameras)), bool)
-    by_head, _ = points_by_head(known.state, points, visible)
-    keypoints = by_head @ known.head @ np.swapaxes(by_head, -1, -2)
-    focal = known.standard_deviations[0][:, :2] / known.state.params[:, :2]
-    return np.array([_mean_trace(known.centers()), (focal**2).mean(), _mean_trace(keypoints)])
-
-
-def squared_errors(given: Problem, state: RigState) -> np.ndarray:
-    """Mean squared errors [3] against truth, metres² or relative, in the order of `FIGURES`."""
-    truth = given.truth
-    centers, true_centers = (s.camera_from_rig.inverse.translation for s in (state, truth))
-    align = fit_similarity(centers, true_centers, fixed_scale=1.0).target_from_source
-    focal = state.params[:, :2] / truth.params[:, :2] - 1
-    found = triangulated(truth, state, given.scene.keypoints)
-    return np.array(
-        [
-            ((align.apply(centers) - true_centers) ** 2).sum(-1).mean(),
-            (focal**2).mean(),
-            ((align.apply(found) - given.scene.keypoints) ** 2).sum(-1).mean(),
-        ]
-    )
-
-
-def triangulated(truth: RigState, state: RigState, points: np.ndarray) -> np.ndarray:
-    """Where a rig sees points [N, 3] whose images are exact: Gauss-Newton from the true places."""
-    exact = []
-    for params, pose in zip(truth.params, _each(truth.camera_from_rig), strict=True):
-        exact.append(Camera("OPENCV", 1, 1, params).project(pose.apply(points))[0])
-    found = points.copy()
-    for _ in range(10):
-        normal, gradient = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-        for params, pose, pixels in zip(state.params, _each(state.camera_from_rig), exact, strict=True):
-            camera = Camera("OPENCV", 1, 1, params)
-            radius = np.asarray(camera.monotonic_radius)
-            by_point, _ = lens.projection_jacobians(camera.intrinsics, radius, pose.apply(found))
-            by_point = by_point @ pose.rotation
-            residual = camera.project(pose.apply(found))[0] - pixels
-            normal += np.swapaxes(by_point, -1, -2) @ by_point
-            gradient += (np.swapaxes(by_point, -1, -2) @ residual[..., None])[..., 0]
-        found = found - np.linalg.solve(normal, gradient[..., None])[..., 0]
-    return found
 
 
 def accuracy(seeds: int) -> None:
@@ -297,44 +184,6 @@ def _predicted_deviations(given: Problem, predicted: list[Uncertainty]) -> dict[
         calibration, _ = still.points(points, visible, 0.0)
         collected["keypoints"].append(np.sqrt(np.diagonal(calibration, axis1=1, axis2=2)))
     return {name: np.mean(values, axis=0) for name, values in collected.items()}
-
-
-def peers(seeds: int) -> None:
-    """Print wall times and errors of the joint solve beside other programs', 10% outliers, same start."""
-    solvers: dict[str, Callable[[Problem, Start], RigState]] = {
-        "ours": lambda given, begin: solve(given, begin)[0].state,
-        "pycolmap": lambda given, begin: (
-            adjust_with_colmap(
-                begin.views, begin.state, begin.trusted, given.scene.observations.image_sizes
-            ).state
-        ),
-    }
-    runs = min(seeds, 5)
-    print(f"\nJoint solve at 10% outliers from the same start, {runs} seeds, reference problem")
-    for absent in ("aniposelib", "mrcal"):
-        if importlib.util.find_spec(absent) is None:
-            print(f"  {absent} is not installed: not measured")
-    print(f"{'solver':>10} {'wall s':>8} {'centre mm':>10} {'keypts um':>10}")
-    rows: dict[str, list[tuple[float, np.ndarray]]] = {name: [] for name in solvers}
-    for seed in range(runs):
-        given = problem(SceneConfig(outliers=0.1), seed)
-        begin = start(given)
-        for name, run in solvers.items():
-            began = time.perf_counter()
-            state = run(given, begin)
-            rows[name].append((time.perf_counter() - began, squared_errors(given, state)))
-    for name, measured in rows.items():
-        rms = np.sqrt(np.mean([errors for _, errors in measured], axis=0))
-        wall = np.median([seconds for seconds, _ in measured])
-        print(f"{name:>10} {wall:>8.2f} {rms[0] * 1e3:>10.4f} {rms[2] * 1e6:>10.2f}")
-
-
-def _each(poses: Rigid) -> list[Rigid]:
-    return [Rigid(r, t) for r, t in zip(poses.rotation, poses.translation, strict=True)]
-
-
-def _mean_trace(covariances: np.ndarray) -> float:
-    return float(np.trace(covariances, axis1=-2, axis2=-1).mean())
 
 
 def _kept_views(views: BoardViews, kept: BoardViews) -> np.ndarray:

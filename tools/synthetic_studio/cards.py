@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import open3d as o3d
 
 from synthetic_studio.lighting import KEY_DIRECTION, Occluders, bake_surface
 from synthetic_studio.proxies import Proxy
+from synthetic_studio.raycasting import raycasting_scene
 from synthetic_studio.regions import smoothstep
 from synthetic_studio.strands import unit
 from synthetic_studio.subdivision import catmull_clark, subdivide_corner_uvs, triangulate, vertex_normals
@@ -167,9 +167,7 @@ class CardLayers:
 
     def __init__(self, parts: tuple[Cards, ...]) -> None:
         self._shaders = [CardShader(cards) for cards in parts]
-        self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        for cards in parts:
-            self._scene.add_triangles(cards.vertices.astype(np.float32), cards.triangles.astype(np.uint32))
+        self._scene = raycasting_scene([(cards.vertices, cards.triangles) for cards in parts])
 
     def over(
         self,

@@ -43,6 +43,9 @@ class SensorConfig:
     exposure: float = 1.0
     """Factor on the linear light before clipping."""
 
+    exposure_seed: int | None = None
+    """Photograph the same scene again: each number gives other noise, and nothing else changes."""
+
 
 @dataclass(frozen=True)
 class BoardConfig:
@@ -140,7 +143,7 @@ NOT_CONTENT = ("output", "jobs", "dry_run", "assets")
 
 
 def content(config: StudioConfig) -> dict[str, Any]:
-    """The part of the configuration that the files depend on, as plain JSON values."""
+    """The part of the configuration that the files depend on, as plain JSON values, without what was not chosen."""
     chosen = {name: value for name, value in asdict(config).items() if name not in NOT_CONTENT}
     return _plain(chosen | {"assets": config.assets is not None})  # whether, not where they lie on this disk
 
@@ -184,6 +187,7 @@ def _validate_sensor(sensor: SensorConfig) -> None:
     _check_range("--sensor.read-noise", sensor.read_noise, 0, 1e6)
     _check_range("--sensor.vignetting", sensor.vignetting, 0, 4)
     _check_range("--sensor.exposure", sensor.exposure, 1e-3, 1e3)
+    _check_range("--sensor.exposure-seed", sensor.exposure_seed or 0, 0, 2**63 - 1)
 
 
 def _validate_board(board: BoardConfig) -> None:
@@ -221,5 +225,5 @@ def _check_finite(config: Any, prefix: str) -> None:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _plain(item) for key, item in value.items() if item is not None}
     return list(value) if isinstance(value, tuple) else value

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import open3d as o3d
 from scipy.spatial import cKDTree
 
 from synthetic_studio.assets import Chosen, choose, read_library
@@ -19,6 +18,7 @@ from synthetic_studio.identity import HAIR_COLOURS, IRIS_COLOURS, Identity
 from synthetic_studio.lighting import Occluders
 from synthetic_studio.painted_skin import draw_tone, iris_colour, paint_skin
 from synthetic_studio.proxies import Proxy
+from synthetic_studio.raycasting import raycasting_scene
 from synthetic_studio.skin import Skin
 from synthetic_studio.strands import unit
 from synthetic_studio.streams import Stream, generator
@@ -162,8 +162,7 @@ def _clearance(points: np.ndarray) -> np.ndarray:
 
 def _on_skin(vertices: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
     """Lift vertices ``[V, 3]`` out of the skin; return them and the skin's light there, on both sides ``[V, 2]``."""
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(surface.vertices.astype(np.float32), surface.triangles.astype(np.uint32))
+    scene = raycasting_scene([(surface.vertices, surface.triangles)])
     closest = scene.compute_closest_points(vertices.astype(np.float32), nthreads=1)
     foot = closest["points"].numpy().astype(np.float64)
     outward = unit(closest["primitive_normals"].numpy().astype(np.float64))

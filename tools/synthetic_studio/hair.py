@@ -11,6 +11,7 @@ import open3d as o3d
 from scipy.spatial import cKDTree
 
 from synthetic_studio.identity import HAIR_COLOURS, Identity
+from synthetic_studio.raycasting import raycasting_scene
 from synthetic_studio.regions import SurfacePoints, coarse_ear_mask, eye_midpoint, scalp_mask, smoothstep
 from synthetic_studio.strands import Strands, resample, unit
 from synthetic_studio.template import HeadTemplate
@@ -182,8 +183,7 @@ def _grow_guides(
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Integrate guides ``[G, K, 3]`` over the head; also return the outward normals ``[G, 3]`` at their roots."""
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(vertices.astype(np.float32), template.coarse_triangles.astype(np.uint32))
+    scene = raycasting_scene([(vertices, template.coarse_triangles)])
     _, normal, _ = _closest(scene, root)
     outward = normal
     layer = rng.uniform(0.15, 1.0, (len(root), 1)) * style.volume

@@ -18,6 +18,7 @@ from synthetic_studio.hair import grow_hair, light_from_guides, shadow_casters
 from synthetic_studio.identity import Identity, sample_identity
 from synthetic_studio.landmarks import facemesh_landmarks, keypoints
 from synthetic_studio.lighting import Occluders, bake_strands, bake_surface
+from synthetic_studio.raycasting import raycasting_scene
 from synthetic_studio.regions import head_regions, smoothstep
 from synthetic_studio.skin import Skin, make_skin
 from synthetic_studio.strands import Strands, concatenate, ribbons, unit
@@ -108,8 +109,8 @@ def build_head(seed: int, index: int, assets: Path | None = None) -> Head:
     casters = [ribbons(shadow_casters(grown[0]))] if grown else []
     casters += [dressing.hair.shadow()] if dressing.hair else []
     occluders = Occluders(
-        _scene([(coarse, template.coarse_triangles), *eye_meshes.values()]),
-        _scene(casters) if casters else None,
+        raycasting_scene([(coarse, template.coarse_triangles), *eye_meshes.values()]),
+        raycasting_scene(casters) if casters else None,
     )
     surface = _skin_surface(template, coarse, fine, occluders)
     short = [_lit_from_skin(part, surface) for part in facial]
@@ -131,7 +132,9 @@ def build_head(seed: int, index: int, assets: Path | None = None) -> Head:
         strands=strands,
         ribbon_triangles=ribbon_triangles,
         cards=dressing.cards(surface, occluders),
-        scene=_scene([(fine, template.triangles), *eye_meshes.values(), (ribbon_vertices, ribbon_triangles)]),
+        scene=raycasting_scene(
+            [(fine, template.triangles), *eye_meshes.values(), (ribbon_vertices, ribbon_triangles)]
+        ),
     )
 
 
@@ -147,13 +150,6 @@ def _shirt(fine: np.ndarray, template: HeadTemplate) -> np.ndarray:
     normals = vertex_normals(fine, template.triangles)
     inside = smoothstep(0.002, -0.004, head_regions().above_neckline)
     return fine + 0.005 * inside[:, None] * normals
-
-
-def _scene(parts: list[tuple[np.ndarray, np.ndarray]]) -> o3d.t.geometry.RaycastingScene:
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    for vertices, triangles in parts:
-        scene.add_triangles(vertices.astype(np.float32), triangles.astype(np.uint32))
-    return scene
 
 
 def _skin_surface(

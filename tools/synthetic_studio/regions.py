@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import open3d as o3d
 
+from synthetic_studio.raycasting import raycasting_scene
 from synthetic_studio.template import HeadTemplate, head_template
 
 # Height of the hairline against the azimuth about the head's vertical axis: forehead, temple,
@@ -106,8 +106,7 @@ def project_to_face(xy: np.ndarray) -> SurfacePoints:
     """Find the points of the average's coarse skin that lie straight behind ``xy`` ``[P, 2]``, seen from the front."""
     template = head_template()
     vertices = template.average[: template.skin_vertex_count] - eye_midpoint(template)
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(vertices.astype(np.float32), template.coarse_triangles.astype(np.uint32))
+    scene = raycasting_scene([(vertices, template.coarse_triangles)])
     rays = np.concatenate(
         [xy, np.full((len(xy), 1), 0.5), np.broadcast_to([0.0, 0.0, -1.0], (len(xy), 3))], axis=1
     )

@@ -232,7 +232,9 @@ class Studio:
         config = self.config
         strength = vignetting_strength(config.sensor, config.seed, camera)
         falloff = vignetting(self.rig(take)[camera].camera, strength)
-        noise = generator(config.seed, stream, take, camera, *entities)
+        again = config.sensor.exposure_seed
+        exposure = () if again is None else (again,)
+        noise = generator(config.seed, stream, take, camera, *entities, *exposure)
         write_png(made(path), expose(light, falloff, config.sensor, noise))
 
 

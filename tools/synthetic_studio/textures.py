@@ -5,20 +5,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from preface.capture.images import read_image
+from preface.capture.images import light_of_levels, read_image
 
 
 def read_texture(path: Path) -> np.ndarray:
     """Return a texture as linear RGB and alpha, ``[H, W, 4]`` float32 in 0..1; raises ImageError."""
     pixels = read_image(path)
-    # A float image (EXR) is linear already.
-    if pixels.dtype.kind == "f":
+    if pixels.dtype.kind == "f":  # EXR is linear already
         values = pixels.astype(np.float32).clip(0.0, 1.0)
         colour = values[..., :3]
     else:
         values = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
-        colour = values[..., : 3 if pixels.shape[2] > 1 else 1]
-        colour = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+        colour = light_of_levels(pixels.dtype)[pixels[..., : 3 if pixels.shape[2] > 1 else 1]]
     alpha = values[..., 3:] if pixels.shape[2] == 4 else np.ones_like(values[..., :1])
     colour = np.broadcast_to(colour, (*colour.shape[:2], 3))
     return np.ascontiguousarray(np.concatenate([colour, alpha], axis=2), np.float32)

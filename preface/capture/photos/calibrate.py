@@ -63,6 +63,7 @@ class PhotoCalibration:
     """What the photographs gave.
 
     Attributes:
+        photographs: all of them, in the order of their names or as given.
         rig: a camera for each registered photograph, in the frame of the first one's.
         missing: why each other photograph was not registered, by id.
         candidates: the camera models that were tried, from simple to complex.
@@ -73,6 +74,7 @@ class PhotoCalibration:
         tracks: the sightings.
     """
 
+    photographs: tuple[Photograph, ...]
     rig: Rig
     missing: Mapping[str, str]
     candidates: tuple[Candidate, ...]
@@ -130,6 +132,7 @@ def calibrate_photos(
     table = [candidate.summary() | {"chosen": index == chosen} for index, candidate in enumerate(candidates)]
     metadata = {"scale": scale, "not_registered": missing, "camera_models": table}
     return PhotoCalibration(
+        photographs=tuple(photographs),
         rig=_rig(options.take, ids, structure, mapped.tracks, candidates[chosen], metadata),
         missing=missing,
         candidates=candidates,

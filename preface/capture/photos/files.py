@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from preface.artifacts import ArtifactError
-from preface.capture.images import IMAGE_SUFFIXES, ImageHeader, read_header, read_image
+from preface.capture.images import IMAGE_SUFFIXES, ImageHeader, display_tones, read_header, read_image
 
 Sharing = Literal["one", "folder", "each"]
 
@@ -190,14 +190,10 @@ def _grey(pixels: np.ndarray) -> np.ndarray:
     """8-bit grey [height, width] of an image as `read_image` returns it."""
     import cv2
 
-    if pixels.dtype == np.uint16:
-        pixels = (pixels // 257).astype(np.uint8)
-    elif pixels.dtype != np.uint8:  # EXR: linear light, and features want an even spread of tones
-        tones = np.clip(np.nan_to_num(pixels.astype(np.float32), posinf=1.0), 0, 1) ** (1 / 2.2)
-        pixels = np.round(255 * tones).astype(np.uint8)
+    pixels = display_tones(pixels[..., :3])
     if pixels.shape[2] == 1:
         return pixels[..., 0]
-    return cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(np.ascontiguousarray(pixels), cv2.COLOR_RGB2GRAY)
 
 
 def _mask(masks: Path, photograph: Photograph) -> np.ndarray:

@@ -1,5 +1,7 @@
 """Small photographs of boards with known corners: OpenCV's print, seen in perspective, area-filtered."""
 
+import struct
+
 import cv2
 import numpy as np
 
@@ -77,3 +79,14 @@ def seen(board, pixels_from_board):
     """True pixels [P, 2] of the board's points."""
     points = board_points(board)[:, :2]
     return cv2.perspectiveTransform(points[None], pixels_from_board)[0]
+
+
+def ask_for_rotation(mp4):
+    """Have an MP4 file ask for a quarter turn, as phones do: by the matrix in its track header."""
+    content = bytearray(mp4.read_bytes())
+    # ISO 14496-12: after the type "tkhd" of version 0 come 40 bytes, then the matrix (16.16; the last column 2.30).
+    matrix = content.index(b"tkhd") + 4 + 40
+    upright = struct.pack(">9i", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
+    assert content[matrix : matrix + 36] == upright
+    content[matrix : matrix + 36] = struct.pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, 0, 0, 1 << 30)
+    mp4.write_bytes(content)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from board_pictures import CHARUCO, CHESSBOARD, HEIGHT, WIDTH, homography, picture, seen
+from board_pictures import CHARUCO, CHESSBOARD, HEIGHT, WIDTH, ask_for_rotation, homography, picture, seen
 
 from preface.artifacts import ArtifactError
 from preface.capture.boards import board_points, describe_board
@@ -159,6 +159,18 @@ def test_a_chessboard_of_another_size_is_explained(tmp_path):
         detect(tmp_path, describe_board("chessboard", (8, 5), 0.03))
 
 
+@pytest.mark.parametrize("printed", ["legacy", "current"])
+def test_a_pattern_of_the_other_opencv_is_explained(tmp_path, printed):
+    board = describe_board("charuco", (6, 6), 0.03, 0.022, "DICT_4X4_50", legacy=printed == "legacy")
+    folder = tmp_path / "calibration" / "front"
+    folder.mkdir(parents=True)
+    write_png(folder / "0.png", picture(board, homography(board)))
+    assert detect(tmp_path, board).observations.counts.sum() > 15
+    other = replace(board, legacy=not board.legacy)
+    with pytest.raises(DetectionError, match=f"found a {printed} pattern, expected the other .*'legacy'"):
+        detect(tmp_path, other)
+
+
 def test_a_chessboard_that_looks_the_same_upside_down_is_pointed_out(tmp_path):
     board = describe_board("chessboard", (6, 4), 0.03)
     folder = tmp_path / "calibration" / "front"
@@ -220,4 +232,11 @@ def test_an_empty_video_is_an_error_that_names_it(filmed, tmp_path):
     folder = shutil.copytree(filmed, tmp_path / "film")
     (folder / "cam_1.mp4").write_bytes(b"")
     with pytest.raises(ArtifactError, match=r"cam_1\.mp4: file: is empty"):
+        detect(folder)
+
+
+def test_a_rotated_video_is_refused_before_any_frame_is_searched(filmed, tmp_path):
+    folder = shutil.copytree(filmed, tmp_path / "film")
+    ask_for_rotation(folder / "cam_1.mp4")
+    with pytest.raises(ArtifactError, match=r"cam_1\.mp4: rotation: .*90 degrees.*Rotate the pixels"):
         detect(folder)

@@ -134,3 +134,15 @@ def test_a_finger_on_the_board_costs_the_corners_under_it_and_moves_none():
     assert 9 not in found.points
     assert len(found.points) >= 15
     np.testing.assert_allclose(found.pixels, truth[found.points], atol=0.3)
+
+
+def test_pixels_that_are_no_number_move_no_corner():
+    pose = homography(CHARUCO, 1)
+    image, truth = picture(CHARUCO, pose).astype(np.float32), seen(CHARUCO, pose)
+    light = (image / 255) ** 2.2
+    for index, odd in ((4, np.nan), (9, np.inf)):
+        column, row = truth[index].astype(int)
+        light[row + 3, column - 3 : column + 4] = odd
+    found = find_board(CHARUCO, light)
+    assert len(found.points) >= 15
+    np.testing.assert_allclose(found.pixels, truth[found.points], atol=0.3)

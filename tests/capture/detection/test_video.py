@@ -1,8 +1,11 @@
 """Timestamps are matched to videos, or it is said why they cannot be."""
 
+import shutil
+
 import cv2
 import numpy as np
 import pytest
+from board_pictures import ask_for_rotation
 
 from preface.capture.video import (
     VideoError,
@@ -56,6 +59,13 @@ def test_what_is_no_video_is_refused(tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(VideoError, match=r"a\.mp4"):
         read_video_header(path)
+
+
+def test_a_video_that_asks_to_be_rotated_is_refused(tmp_path, video):
+    turned = shutil.copy(video, tmp_path / "cam_2.mp4")
+    ask_for_rotation(turned)
+    with pytest.raises(VideoError, match=r"cam_2\.mp4: rotation: the file asks to be rotated by 90 degrees"):
+        read_video_header(turned)
 
 
 def test_lines_count_the_frames_of_the_video(tmp_path, video):

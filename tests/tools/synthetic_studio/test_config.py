@@ -22,6 +22,7 @@ BAD_FLAGS = [
     ("--sensor.full-well", "-5"),
     ("--sensor.read-noise", "inf"),
     ("--sensor.exposure", "0"),
+    ("--sensor.exposure-seed", "-1"),
     ("--sensor.vignetting", "-1"),
     ("--board.frames", "0"),
     ("--board.tilt", "90"),

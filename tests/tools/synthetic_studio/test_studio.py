@@ -133,6 +133,19 @@ def test_another_seed_changes_every_image(finished, tmp_path):
     assert not [name for name in one if one[name] == other[name] and name.endswith((".png", ".exr", ".npz"))]
 
 
+def test_another_exposure_has_other_noise_and_the_same_scene(finished, tmp_path):
+    make(tmp_path / "again", sensor=SensorConfig(exposure_seed=1))
+    first, again = contents(finished), contents(tmp_path / "again")
+    assert first.keys() == again.keys()
+    photographs = {name for name in first if name.startswith("capture/") and name.endswith(".png")}
+    told = {"capture/capture.json", "truth/studio.json"}  # they say which exposure it is
+    assert {name for name in first if first[name] != again[name]} == photographs | told
+    assert "exposure_seed" not in first["capture/capture.json"].decode()
+    name = "capture/subjects/id0000/cam00.png"
+    difference = read_image(finished / name).astype(float) - read_image(tmp_path / "again" / name)
+    assert 0 < np.abs(difference).mean() < 3
+
+
 def test_an_interrupted_studio_is_finished_byte_for_byte(finished, copy):
     for lost in (
         "capture/capture.json",
