@@ -19,7 +19,7 @@ from preface.capture.calibration.initial import FLEXIBLE_MODEL, Alone, calibrate
 from preface.capture.calibration.selection import Candidate, held_out, select_model
 from preface.capture.calibration.spanning_tree import assemble
 from preface.capture.calibration.state import free_head
-from preface.capture.calibration.unsynchronised import UNSYNCHRONISED, adjust_moving, unsynchronised
+from preface.capture.calibration.unsynchronised import adjust_moving, unsynchronised
 from preface.capture.calibration.views import BoardViews, stack_views
 from preface.capture.observations import Observations
 from preface.capture.rig import Coverage, HeldOutError, ReprojectionError, Rig, RigCamera, StandardDeviations
@@ -27,6 +27,9 @@ from preface.geometry.cameras import CAMERA_MODELS, Camera
 from preface.geometry.transforms import Rigid
 
 CameraModel = Literal["auto", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"]
+
+# A rigid rig whose errors exceed its cameras' own by this factor is reported: its standard deviations are wrong.
+SUSPICIOUS = 2.0
 
 
 @dataclass(frozen=True)
@@ -104,12 +107,13 @@ class Calibration:
                 f"{self.reprojection_rms_at_rest:.2f} px. Hold the board still, or trigger the cameras together",
             )
         ratio = self.uncertainty.sigma / self.sigma_alone
-        if ratio < UNSYNCHRONISED:
+        if ratio < SUSPICIOUS:
             return ()
         return (
             f"errors are {ratio:.1f} times larger in the rig ({self.uncertainty.sigma:.2f} px) than in each camera "
-            f"alone ({self.sigma_alone:.2f} px): the cameras do not take a frame at the same instant, or something "
-            "moved. Standard deviations are then too small; hold the board still in each frame",
+            f"alone ({self.sigma_alone:.2f} px): the camera model is too simple, the cameras do not take a frame "
+            "at the same instant, or something moved. Standard deviations are then too small; try --camera-model "
+            "auto, and hold the board still in each frame",
         )
 
     @property
