@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The project at work on a bare machine: sets up, makes a small synthetic studio, checks it, calibrates its
-# cameras from its pictures of a board, and shows it.
+# cameras from its pictures of a board, aligns its people, and shows it.
 # Every step prints the command that it runs. Run again, it resumes where it stopped. Prints the path of
 # the page that shows the results last.
 #   OUTPUT=DIR   where to put everything (default: demo_output)
@@ -26,8 +26,10 @@ stage "synthetic studio" $bin/python tools/synthetic_studio --output "$studio" \
 stage inspection $bin/preface-inspect "$studio/capture"
 stage calibration $bin/preface-calibrate board "$studio/capture" --output "$studio"
 stage "inspection of the rigs" $bin/preface-inspect "$studio"/rigs/take??.json
+stage alignment $bin/preface-align studio "$studio/capture" --rig "$studio" --output "$studio/alignment"
+stage "inspection of the alignment" $bin/preface-inspect "$studio/alignment"
 stage page $bin/python tools/show_studio.py "$studio" --took "${took[@]}"
 
 here=$(cd "$studio" && pwd)
-printf '\nReports, one per stage: %s\n' "$here"/rigs/take??.report.html
+printf '\nReports, one per stage: %s\n' "$here"/rigs/take??.report.html "$here/alignment/report.html"
 printf '\nOpen this page: %s\n' "$here/report.html"

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from preface.artifacts import ArtifactError, read_artifact, resolve_inside, validate, write_artifact
+from preface.capture.folders import files, images_by_stem, implied_manifest
 from preface.capture.images import IMAGE_SUFFIXES
 from preface.plain_words import suggestion
 
@@ -83,10 +84,18 @@ class Take:
 
 @dataclass(frozen=True)
 class Subject:
-    """A person, photographed once by all cameras, during one take."""
+    """A person, photographed once by all cameras, during one take.
+
+    Attributes:
+        id: the name.
+        take: the take's id.
+        images: camera id to the photograph, relative to the capture, where the layout does not say it, as when
+            there are several of each camera; cameras without an entry have not seen the subject then.
+    """
 
     id: str
     take: str
+    images: Mapping[str, str] | None = None
 
 
 @dataclass(frozen=True)
@@ -149,7 +158,7 @@ class Capture:
             ArtifactError: one of them leads out of the capture's folder.
         """
         artifact, folder = self.directory / FILE_NAME, f"{take.calibration_folder}/{camera_id}"
-        names = sorted(entry.name for entry in _files(self.directory / folder))
+        names = sorted(entry.name for entry in files(self.directory / folder))
         return [resolve_inside(artifact, folder, f"{folder}/{name}") for name in names]
 
 
@@ -177,7 +186,7 @@ def _read_capture(path: Path) -> Capture:
     inferred = path.is_dir() and not os.path.lexists(manifest_path)
     if inferred:
         manifest_path = path / f"{FILE_NAME} (inferred)"
-        payload = _infer(path)
+        payload = _inferred(path)
         validate(payload, manifest_path, SCHEMA)
     else:
         payload = read_artifact(manifest_path, SCHEMA)
@@ -245,12 +254,18 @@ def _check(manifest: Manifest, path: Path) -> None:
                 resolve_inside(path, f"takes[{index}].{key}", getattr(take, key))
     for index, subject in enumerate(manifest.subjects):
         _check_reference(subject.take, manifest.takes, "take", f"subjects[{index}].take", path)
+        for camera in subject.images or ():
+            _check_reference(camera, manifest.cameras, "camera", f"subjects[{index}].images", path)
     for key in ("images", "masks"):
         _check_template(getattr(manifest.layout, key), f"layout.{key}", path)
 
 
 def _check_reference(
-    name: str, entries: tuple[Board, ...] | tuple[Take, ...], kind: str, place: str, path: Path
+    name: str,
+    entries: tuple[Board, ...] | tuple[Take, ...] | tuple[CaptureCamera, ...],
+    kind: str,
+    place: str,
+    path: Path,
 ) -> None:
     known = [entry.id for entry in entries]
     if name not in known:
@@ -292,7 +307,7 @@ def _expand(template: str, identity: str, camera: str) -> str:
 def _find_files(manifest: Manifest, path: Path) -> list[dict[tuple[str, str], Path]]:
     """The images, masks and plates of a manifest, each by (subject or take id, camera id)."""
     folder = path.parent
-    listing = cache(lambda relative: _images_by_stem(folder / relative))
+    listing = cache(lambda relative: images_by_stem(folder / relative))
 
     def find(pattern: str, place: str) -> Path | None:
         parent, _, name = pattern.rpartition("/")
@@ -314,6 +329,10 @@ def _find_files(manifest: Manifest, path: Path) -> list[dict[tuple[str, str], Pa
         find_all({(s, c): (_expand(template, s, c), place) for place, s in subjects for c in cameras})
         for template in (manifest.layout.images, manifest.layout.masks)
     )
+    for (place, identity), subject in zip(subjects, manifest.subjects, strict=True):
+        if subject.images is not None:
+            images = {view: file for view, file in images.items() if view[0] != identity}
+            images |= _listed_images(path, f"{place}.images", subject)
     plates = find_all({(t.id, c): (f"{t.plates_folder}/{c}.*", p) for p, t in takes for c in cameras})
     for place, identity in subjects:
         if not any((identity, c) in images for c in cameras):
@@ -330,46 +349,20 @@ def _find_files(manifest: Manifest, path: Path) -> list[dict[tuple[str, str], Pa
     return [images, masks, plates]
 
 
-def _files(folder: Path) -> list[os.DirEntry[str]]:
-    """The files in a folder that are not hidden; none when there is no such folder."""
-    if not folder.is_dir():
-        return []
-    with os.scandir(folder) as entries:
-        return [entry for entry in entries if not entry.name.startswith(".") and entry.is_file()]
+def _listed_images(path: Path, place: str, subject: Subject) -> dict[tuple[str, str], Path]:
+    """The photographs that a subject lists, each of which must be there."""
+    found = {}
+    for camera, relative in (subject.images or {}).items():
+        file = resolve_inside(path, f"{place}.{camera}", relative)
+        if not file.is_file():
+            problem = f"there is no file {relative}"
+            raise ArtifactError(path, f"{place}.{camera}", problem, "Correct the path, or remove the entry")
+        found[subject.id, camera] = file
+    return found
 
 
-def _images_by_stem(folder: Path) -> dict[str, list[str]]:
-    """Names of the image files in a folder, grouped by the name without its suffix, sorted."""
-    groups: dict[str, list[str]] = {}
-    for name in sorted(entry.name for entry in _files(folder)):
-        if Path(name).suffix.lower() in IMAGE_SUFFIXES:
-            groups.setdefault(Path(name).stem, []).append(name)
-    return groups
-
-
-def _infer(folder: Path) -> dict[str, Any]:
-    """The manifest, as JSON, of a folder in the standard layout."""
-
-    def folders(name: str) -> list[str]:
-        parent = folder / name
-        children = parent.iterdir() if parent.is_dir() else ()
-        return sorted(child.name for child in children if child.is_dir() and not child.name.startswith("."))
-
-    subjects, takes = folders("subjects"), folders("calibration") or ["default"]
-    cameras = sorted(
-        {stem for subject in subjects for stem in _images_by_stem(folder / "subjects" / subject)}
-    )
-    if not cameras:
-        problem = "there is neither a capture.json nor any image at subjects/<identity>/<camera>.*"
-        raise ArtifactError(folder, FILE_NAME, problem, "Correct the path, or write a capture.json")
-    if len(takes) > 1:
-        problem = f"is missing, and there are several takes ({', '.join(takes)})"
-        remedy = "Write a capture.json that says which take each subject belongs to"
-        raise ArtifactError(folder, FILE_NAME, problem, remedy)
-    return {
-        "schema": SCHEMA,
-        "schema_version": 1,
-        "cameras": [{"id": camera} for camera in cameras],
-        "takes": [{"id": takes[0]}],
-        "subjects": [{"id": subject, "take": takes[0]} for subject in subjects],
-    }
+def _inferred(folder: Path) -> dict[str, Any]:
+    """The manifest, as JSON, of a folder in a standard layout."""
+    found = implied_manifest(folder)
+    subjects = [{**subject, "take": found["takes"][0]["id"]} for subject in found["subjects"]]
+    return {"schema": SCHEMA, "schema_version": 1, **found, "subjects": subjects}

@@ -17,10 +17,22 @@ if TYPE_CHECKING:  # these need numpy; --help must not wait for it
     from preface.capture.images import ImageHeader
     from preface.capture.manifest import Capture
 
-_DESCRIPTION = "Validate captures, rigs and reports, print what they hold, and say what is wrong with them."
+_DESCRIPTION = (
+    "Validate captures, rigs, alignments and reports, print what they hold, and say what is wrong with them."
+)
 _EPILOG = "Exit status: 0 when all is well, 1 when something is wrong, 2 for wrong usage."
-_PATH_HELP = "an artefact, or a folder with a capture.json, a rig.json or the standard capture layout"
+_PATH_HELP = "an artefact, or a folder of a capture, a rig or an alignment"
 MAX_LISTED = 20  # problems and missing views beyond this are counted; --json lists them all
+
+
+# What files of these names in a folder are.
+_NAMES = {
+    "capture.json": "preface/capture",
+    "corners.json": "preface/corners",
+    "rig.json": "preface/rig",
+    "alignment.json": "preface/alignment-index",
+    "template.json": "preface/template",
+}
 
 
 @dataclass
@@ -74,12 +86,11 @@ def _artifacts(path: Path) -> list[Report]:
     """Empty reports for the artefacts at a path; in a folder, their names say their schemas."""
     if not path.is_dir():
         return [Report(path)]
-    found = [Report(path / f"{kind}.json", f"preface/{kind}") for kind in ("capture", "corners", "rig")]
-    found = [report for report in found if os.path.lexists(report.path)]
+    found = [Report(path / name, schema) for name, schema in _NAMES.items() if os.path.lexists(path / name)]
     if (path / "subjects").is_dir() and not os.path.lexists(path / "capture.json"):
         found.insert(0, Report(path, "preface/capture"))  # its manifest is inferred
     if not found:
-        problem = "holds neither a capture.json nor a rig.json nor a folder subjects"
+        problem = "holds neither a capture.json nor a rig.json nor an alignment.json nor a folder subjects"
         raise ArtifactError(path, "folder", problem, "Name an artefact or the folder that holds it")
     return found
 
@@ -89,6 +100,10 @@ def _inspect_artifact(report: Report) -> Report:
         "preface/capture": _summarise_capture,
         "preface/corners": _summarise_corners,
         "preface/rig": _summarise_rig,
+        "preface/alignment-index": _summarise_alignment,
+        "preface/template": _summarise_alignment,
+        "preface/alignment": _summarise_alignment,
+        "preface/landmarks": _summarise_alignment,
         "preface/report": _summarise_report,
     }
     try:
@@ -216,6 +231,23 @@ def _summarise_corners(report: Report) -> None:
         ],
         "warnings": list(corners.warnings),
     }
+
+
+# -------------------------------------------------------------------------------------- alignments
+
+
+def _summarise_alignment(report: Report) -> None:
+    from preface.cli import inspect_alignment
+
+    match report.schema:
+        case "preface/alignment-index":
+            report.summary = inspect_alignment.summarise_index(report.path, report.problems)
+        case "preface/template":
+            report.summary = inspect_alignment.summarise_template(report.path)
+        case "preface/alignment":
+            report.summary = inspect_alignment.summarise_person(report.path)
+        case "preface/landmarks":
+            report.summary = inspect_alignment.summarise_landmarks(report.path)
 
 
 # ----------------------------------------------------------------------------------------- reports

@@ -186,6 +186,67 @@ def test_several_takes_cannot_be_inferred(capture):
         read_capture(capture)
 
 
+@pytest.fixture
+def sequences(tmp_path):
+    """Several photographs per camera and subject, whose numbers do not agree, and one take."""
+    for name in ("a/left/00001", "a/left/00365", "a/right/00002", "a/right/00364", "b/right/00009"):
+        image(tmp_path / f"subjects/{name}.png")
+    image(tmp_path / "calibration/left/1.png")
+    return tmp_path
+
+
+def test_of_several_photographs_the_first_of_each_camera_is_the_subjects(sequences):
+    found = read_capture(sequences)
+    assert found.inferred
+    assert [camera.id for camera in found.manifest.cameras] == ["left", "right"]
+    assert {view: file.relative_to(sequences).as_posix() for view, file in found.images.items()} == {
+        ("a", "left"): "subjects/a/left/00001.png",
+        ("a", "right"): "subjects/a/right/00002.png",
+        ("b", "right"): "subjects/b/right/00009.png",
+    }
+    assert found.missing_views == [("b", "left")]
+
+
+def test_folders_of_cameras_in_calibration_are_no_takes(sequences):
+    found = read_capture(sequences)
+    (take,) = found.manifest.takes
+    assert take.id == "default"
+    assert [file.name for file in found.calibration_files(take, "left")] == ["1.png"]
+
+
+def test_a_subject_may_list_its_photographs(sequences):
+    smile = {"left": "subjects/a/left/00365.png", "right": "subjects/a/right/00364.png"}
+    cameras = (CaptureCamera("left"), CaptureCamera("right"))
+    manifest = Manifest(cameras, (Take("t"),), (Subject("smile", "t", smile),))
+    write_capture(sequences, manifest)
+    found = read_capture(sequences)
+    assert found.manifest == manifest
+    assert found.images["smile", "right"] == sequences / smile["right"]
+
+
+@pytest.mark.parametrize(
+    ("images", "words"),
+    [
+        (
+            {"left": "subjects/a/left/7.png"},
+            r"subjects\[0\].images.left: there is no file subjects/a/left/7.png",
+        ),
+        (
+            {"lift": "subjects/a/left/00001.png"},
+            r"'lift' is not one of the cameras .* Perhaps 'left' was meant",
+        ),
+        ({"left": "../elsewhere.png"}, r"subjects\[0\].images.left: .* climbs out"),
+    ],
+)
+def test_a_photograph_that_is_not_there_is_named(sequences, images, words):
+    content = {"cameras": [{"id": "left"}], "takes": [{"id": "t"}]}
+    content |= {"schema": "preface/capture", "schema_version": 1}
+    content["subjects"] = [{"id": "a", "take": "t", "images": images}]
+    (sequences / "capture.json").write_text(json.dumps(content))
+    with pytest.raises(ArtifactError, match=words):
+        read_capture(sequences)
+
+
 # ------------------------------------------------------------------------------------------ boards
 
 

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -70,16 +69,6 @@ def test_help_does_not_wait_for_libraries():
     imported = {line.rpartition("|")[2].strip() for line in result.stderr.splitlines()}
     assert "argparse" in imported
     assert not imported & {"numpy", "cv2", "scipy", "torch", "pycolmap", "matplotlib", "jsonschema"}
-
-
-def test_help_takes_half_a_second_at_most():
-    command = [sys.executable, "-m", "preface.cli.calibrate", "board", "--help"]
-    took = []
-    for _ in range(5):  # the best of a few: other processes share the machine
-        began = time.perf_counter()
-        subprocess.run(command, capture_output=True, check=True)
-        took.append(time.perf_counter() - began)
-    assert min(took) < 0.5
 
 
 def test_the_names_that_help_lists_are_those_there_are():
