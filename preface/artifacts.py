@@ -35,6 +35,7 @@ VERSIONED_PACKAGES = (
     "OpenEXR",
     "mediapipe",
     "pycolmap",
+    "google-crc32c",
 )
 LINE_LENGTH = 100  # written values that fit on one such line stay on one line
 
