@@ -33,7 +33,7 @@ COMPONENTS = 40
 # Mean and standard deviation of the control that scales the nose's depth (0.3 moves its tip by 2.7 mm). The studio's
 # noses vary less than people's; what one photograph does not show must not be claimed to be known.
 NOSE_DEPTH = "nose-scale-depth-incr"
-NOSE_DEPTH_MEAN, NOSE_DEPTH_SPREAD = 0.1, 0.4
+NOSE_DEPTH_MEAN, NOSE_DEPTH_SPREAD = 0.0, 0.4
 # Where the four points of an iris's rim lie about its centre, in radii: x to the subject's left, y up.
 RIM = {1: (1.0, 0.0), 2: (0.0, 1.0), 3: (-1.0, 0.0), 4: (0.0, -1.0)}
 IRISES = {"right": 468, "left": 473}
