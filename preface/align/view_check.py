@@ -331,27 +331,37 @@ def _settle(
     """
     candidates = np.zeros_like(kept)
     candidates[judged] = measured.seen[judged]
-    kept = kept & candidates
-    keypoints = np.arange(COUNT)
-    for _ in range(2 * len(kept)):
-        errors = np.where(kept, _disagreement(measured, kept, options), -1.0)
-        errors = np.where(np.isnan(errors), np.inf, errors)
-        worst = errors.argmax(0)
-        drop = (errors[worst, keypoints] > tolerance) & (kept.sum(0) > 2)
-        kept[worst[drop], keypoints[drop]] = False
-        if not drop.any():
-            break
+    kept = _without_worst(measured, kept & candidates, tolerance, options)
     for view in judged:
         joined = kept.copy()
         joined[view] |= candidates[view]
         errors = _disagreement(measured, joined, options)
         agreeing = (np.where(joined, errors, 0.0) <= tolerance).all(0) & (kept.sum(0) >= 2)
         kept[view] |= candidates[view] & agreeing
-    enough = (kept.sum(1) >= LEAST) & kept[:, EYES].any(1)
-    kept &= enough[:, None]
-    total = (candidates & enough[:, None]).sum(0)
-    supported = kept.sum(0) >= np.where(total < 3, 2, np.maximum(3, np.ceil(options.minimum_share * total)))
-    return kept & supported
+    while True:  # what leaves changes what the rest is held against; nothing comes back, so that this ends
+        before = kept
+        enough = (kept.sum(1) >= LEAST) & kept[:, EYES].any(1)
+        kept = kept & enough[:, None]
+        total = (candidates & enough[:, None]).sum(0)
+        needed = np.where(total < 3, 2, np.maximum(3, np.ceil(options.minimum_share * total)))
+        kept = _without_worst(measured, kept & (kept.sum(0) >= needed), tolerance, options)
+        if np.array_equal(kept, before):
+            return kept
+
+
+def _without_worst(
+    measured: Measured, kept: np.ndarray, tolerance: float, options: TriangulationOptions
+) -> np.ndarray:
+    """Drop the worst view of each keypoint of [V, 5] until all that are left agree."""
+    kept, keypoints = kept.copy(), np.arange(COUNT)
+    while True:
+        errors = np.where(kept, _disagreement(measured, kept, options), -1.0)
+        errors = np.where(np.isnan(errors), np.inf, errors)
+        worst = errors.argmax(0)
+        drop = (errors[worst, keypoints] > tolerance) & (kept.sum(0) > 2)
+        if not drop.any():
+            return kept
+        kept[worst[drop], keypoints[drop]] = False
 
 
 def _disagreement(measured: Measured, kept: np.ndarray, options: TriangulationOptions) -> np.ndarray:
