@@ -180,7 +180,8 @@ def _residuals(report: Report, calibration: Calibration) -> None:
 
 def _frames(report: Report, calibration: Calibration) -> None:
     section = report.section(
-        "Frames", "Reprojection errors as if the board stood still in each frame, whatever cameras saw it when."
+        "Frames",
+        "Reprojection errors as if the board stood still in each frame, whatever cameras saw it when.",
     )
     seen = calibration.observations
     squared = np.where(calibration.inliers, (calibration.residuals_at_rest**2).sum(axis=-1), 0.0)
