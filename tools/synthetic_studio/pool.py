@@ -60,7 +60,7 @@ def run_tasks(config: StudioConfig, subject_module: str, tasks: Sequence[Task]) 
         ProcessPoolExecutor(workers, context, _start, (config, subject_module, stop, finished)) as pool,
     ):
         try:
-            with _interrupts_ignored():  # the children inherit it: Ctrl-C is for the parent to handle
+            with _interrupts_deferred():  # the children inherit it: Ctrl-C is for the parent to handle
                 futures = [pool.submit(_run, task) for task in tasks]
             _watch(futures, bar, finished)
         except BaseException:
@@ -130,12 +130,9 @@ def _environment(variables: dict[str, str]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread receives interrupts, or may change what they do
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _interrupts_deferred() -> Iterator[None]:
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)  # one that came meanwhile arrives now
