@@ -245,7 +245,7 @@ def test_ctrl_c_ends_cleanly_and_says_how_to_resume(tmp_path):
     while not list(output.rglob("frame*.png")) and time.monotonic() < deadline:
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: parent and workers alike
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=120)
     assert process.returncode == 130
     assert "resume" in errors
     assert "Traceback" not in errors
