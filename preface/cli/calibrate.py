@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from preface.artifacts import ArtifactError
+from preface.cli.output import print_lines, whole_number
 from preface.cli.usage import UsageError
 
 _DESCRIPTION = "Calibrate the cameras of a capture, or bring in the calibration of another program."
@@ -46,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except _reasons() as error:
         print(f"{config.source}: {error}", file=sys.stderr)
         return 1
-    return _print(lines)
+    return print_lines(lines)
 
 
 def _keep_blas_to_one_thread() -> None:
@@ -66,19 +67,6 @@ def _reasons() -> tuple[type[Exception], ...]:
     from preface.geometry.errors import GeometryError
 
     return BoardError, CalibrationError, GeometryError, ObservationError
-
-
-def _print(lines: Sequence[str]) -> int:
-    """Print the result; a reader that has gone away does not undo what was written."""
-    try:
-        print(*lines, sep="\n", flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except OSError as error:
-        print(ArtifactError.from_os("standard output", "writing", error), file=sys.stderr)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    return 0
 
 
 # ------------------------------------------------------------------------------------- what to run
@@ -185,7 +173,7 @@ def _add_board(commands: Any) -> None:
     )
     model.add_argument(
         "--held-out",
-        type=_at_least(2),
+        type=whole_number(2),
         default=5,
         metavar="N",
         help="hold every N-th frame out, each in turn, to measure the error on frames not seen (default: 5)",
@@ -207,14 +195,14 @@ def _add_board(commands: Any) -> None:
     )
     parser.add_argument(
         "--search-side",
-        type=_at_least(64),
+        type=whole_number(64),
         default=2048,
         metavar="PIXELS",
         help="boards are searched for in images reduced to this longer side (default: 2048)",
     )
     parser.add_argument(
         "--every",
-        type=_at_least(1),
+        type=whole_number(1),
         default=1,
         metavar="N",
         help="take every N-th frame of videos without timestamps",
@@ -226,7 +214,7 @@ def _add_board(commands: Any) -> None:
         help="use these corners (corners.json) instead of finding the board",
     )
     parser.add_argument(
-        "--jobs", type=_at_least(1), metavar="N", help="processes that find boards (default: all cores)"
+        "--jobs", type=whole_number(1), metavar="N", help="processes that find boards (default: all cores)"
     )
     _add_output(parser, "for several takes a folder, which then holds rigs/TAKE.json")
 
@@ -250,8 +238,8 @@ def _add_photos(commands: Any) -> None:
         help="distance between two photographs' cameras; without it the scale is arbitrary",
     )
     parser.add_argument("--take", metavar="NAME", default="photos", help="name of the take (default: photos)")
-    parser.add_argument("--seed", type=_at_least(0), default=0, help="of everything random (default: 0)")
-    parser.add_argument("--jobs", type=_at_least(1), metavar="N", help="threads (default: all cores)")
+    parser.add_argument("--seed", type=whole_number(0), default=0, help="of everything random (default: 0)")
+    parser.add_argument("--jobs", type=whole_number(1), metavar="N", help="threads (default: all cores)")
     _add_output(parser, "the rig, with one camera per photograph")
 
 
@@ -289,15 +277,6 @@ def _length(text: str) -> float:
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"'{text}' is not a length in metres; write for example 0.022")
     return value
-
-
-def _at_least(smallest: int) -> Any:
-    def number(text: str) -> int:
-        if not text.isdecimal() or int(text) < smallest:
-            raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least {smallest}")
-        return int(text)
-
-    return number
 
 
 if __name__ == "__main__":
