@@ -97,6 +97,10 @@ remove_stray_opencv() {
     step "removing OpenCV wheels that collide ($(xargs <<<"$strays"))" pip uninstall -y $strays "$opencv_wheel"
 }
 
+lpips_weights() { # without the paths that it prints
+    "$python" -m preface.model.metrics.lpips_weights >/dev/null
+}
+
 exit_if_ready() {
     if [ -x "$python" ] && [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$(fingerprint)" ]; then
         say "ready ($venv)"
@@ -133,6 +137,8 @@ step "installing $mediapipe" pip install --no-deps "$mediapipe"
 step "installing preface, editable" pip install --no-deps --no-build-isolation --editable .
 say "checking that everything imports in one process"
 "$python" tools/check_environment.py || fail "the environment does not fit together; see above"
+
+step "fetching the weights of LPIPS (64 MB, once per user)" lpips_weights
 
 # Minutes on the first start of a machine, a second afterwards; better here than in the middle of a test.
 step "reading the parametric head (slow the first time on a machine)" \
