@@ -275,7 +275,7 @@ IMAGES = [
          "Export the image as PNG"),
     Case("half a header", lambda f: os.truncate(f / "subjects/a/front.png", 20), "front.png", "header",
          "Copy or export"),
-    Case("rotated", rotated, "front.jpg", "EXIF orientation", "Rotate the pixels, or remove the tag"),
+    Case("rotated", rotated, "front.jpg", "EXIF orientation", "Turn the pixels"),
     Case("palette", picture("P"), "front.tif", "header", "grey, RGB or RGBA"),
     Case("CMYK", picture("CMYK", "subjects/a/front.jpg"), "front.jpg", "header", "grey, RGB or RGBA"),
     Case("bilevel", picture("1"), "front.tif", "header", "grey, RGB or RGBA"),

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import starmap
 from pathlib import Path
 
+import numpy as np
 from tqdm import tqdm
 
 from preface.align.face_search import find_landmarks
@@ -19,6 +20,7 @@ from preface.capture.images import displayable, read_image
 
 View = tuple[str, str]  # subject, camera
 Found = ViewLandmarks | NoFace
+Read = Callable[[Path], np.ndarray]
 
 AHEAD = 3  # tasks per worker that wait for it
 FEW = 8  # images; starting processes for them would take longer
@@ -58,6 +60,7 @@ def detect_views(
     images: Mapping[View, Path],
     options: DetectionOptions | None = None,
     done: Callable[[View, Found], None] | None = None,
+    read: Read = read_image,
 ) -> dict[View, Found]:
     """Find the subject's landmarks in every view.
 
@@ -67,6 +70,7 @@ def detect_views(
         images: (subject, camera) to the photograph.
         options: how.
         done: called in this process with each view as soon as it is done, in any order.
+        read: gives the pixels of a photograph, a function of a module, as it goes to other processes.
 
     Returns:
         (subject, camera) to the landmarks, or to why there are none, in the order of ``images``; the result does
@@ -79,7 +83,7 @@ def detect_views(
     options = options or DetectionOptions()
     found: dict[View, Found] = {}
     with tqdm(total=len(images), desc="looking for faces", unit="image", disable=None) as bar:
-        for view, result in _run(images, options):
+        for view, result in _run(images, options, read):
             found[view] = result
             bar.update()
             if done is not None:
@@ -87,10 +91,10 @@ def detect_views(
     return {view: found[view] for view in images}
 
 
-def _run(images: Mapping[View, Path], options: DetectionOptions) -> Iterator[tuple[View, Found]]:
+def _run(images: Mapping[View, Path], options: DetectionOptions, read: Read) -> Iterator[tuple[View, Found]]:
     workers = min(options.jobs or len(os.sched_getaffinity(0)), max(len(images), 1))
     if workers == 1 or (len(images) <= FEW and not options.jobs):
-        detector = _Detector(options)
+        detector = _Detector(options, read)
         yield from starmap(detector, images.items())
         return
     # MediaPipe's threads do not survive a fork.
@@ -99,7 +103,7 @@ def _run(images: Mapping[View, Path], options: DetectionOptions) -> Iterator[tup
     try:
         waiting: set[Future[tuple[View, Found]]] = set()
         for view, path in images.items():
-            waiting.add(pool.submit(_detect, options, view, path))
+            waiting.add(pool.submit(_detect, options, read, view, path))
             if len(waiting) >= AHEAD * workers:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 yield from (future.result() for future in done)
@@ -122,15 +126,16 @@ def _start_worker() -> None:
 class _Detector:
     """The models of one process, and how to use them."""
 
-    def __init__(self, options: DetectionOptions):
+    def __init__(self, options: DetectionOptions, read: Read):
         self.options = options
+        self.read = read
         self.models = FaceModels(options.landmark_model)
 
     def __call__(self, view: View, path: Path) -> tuple[View, Found]:
         try:
-            image = displayable(read_image(path))
+            image = displayable(self.read(path))
         except ArtifactError as error:
-            return view, NoFace(f"{error.field}: {error.problem}")
+            return view, NoFace(f"{error.field}: {error.problem}. {error.remedy}")
         chosen = self.options
         return view, find_landmarks(image, self.models, chosen.scale, chosen.rotations, chosen.jitters)
 
@@ -138,8 +143,8 @@ class _Detector:
 _detector: _Detector | None = None  # of this worker process, made with its first task
 
 
-def _detect(options: DetectionOptions, view: View, path: Path) -> tuple[View, Found]:
+def _detect(options: DetectionOptions, read: Read, view: View, path: Path) -> tuple[View, Found]:
     global _detector
-    if _detector is None or _detector.options != options:
-        _detector = _Detector(options)
+    if _detector is None or (_detector.options, _detector.read) != (options, read):
+        _detector = _Detector(options, read)
     return _detector(view, path)

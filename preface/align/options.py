@@ -36,6 +36,9 @@ class AlignmentOptions:
     view_tolerance: float = 0.03
     """How far each of the five keypoints of a view may be from where the other views put it, as a share of the
     distance between the outer eye corners. Keypoints beyond are left out, and views with fewer than three left."""
+    credible_deviation: float = 0.016
+    """Largest standard deviation of a keypoint that a view contributes, as a share of the distance between the outer
+    eye corners, where the detector's errors by direction are known; the three best views of a keypoint always do."""
     minimum_keypoints: int = 4
     """Keypoints that a subject needs; those with fewer are excluded. Three determine a similarity and four
     check it."""

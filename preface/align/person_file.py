@@ -141,6 +141,8 @@ def _view(verdict: ViewVerdict, found: ViewLandmarks | NoFace | None) -> dict[st
     view["disagreement"] = by_keypoint(verdict.disagreement)
     if verdict.left_out:
         view["left_out"] = verdict.left_out
+    if verdict.correction is not None:
+        view["correction"] = by_keypoint(np.round(verdict.correction, PIXEL_DECIMALS))
     if isinstance(found, ViewLandmarks):
         view["pixels"] = _points(found.pixels, PIXEL_DECIMALS)
         view["sigma"] = _numbers(found.sigma, PIXEL_DECIMALS)
@@ -243,7 +245,8 @@ def _read_landmarks(
 def _read_verdict(view: Mapping[str, Any]) -> ViewVerdict:
     disagreement = from_keypoints(view["disagreement"], ())
     left_out = tuple(view.get("left_out", ()))
-    return ViewVerdict(view["used"], view["code"], view["reason"], disagreement, left_out)
+    correction = from_keypoints(view["correction"], (2,)) if "correction" in view else None
+    return ViewVerdict(view["used"], view["code"], view["reason"], disagreement, left_out, correction)
 
 
 def _read_found(

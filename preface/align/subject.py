@@ -5,6 +5,9 @@ in one image; from image to image it finds different points of the skin. That er
 distance between the outer eye corners, added in quadrature, and then measured: the residuals of all landmarks say how
 many times larger or smaller than assumed they are, and the covariances are scaled by that (the variance factor of
 least-squares adjustment).
+
+Where the detector's bias is known (`landmark_bias`), a first look at the face says from where each view sees it; then
+the landmarks are corrected, and their deviations by direction take the place of the one share.
 """
 
 from __future__ import annotations
@@ -17,16 +20,22 @@ import numpy as np
 from preface.align.errors import AlignmentError
 from preface.align.keypoints import CANONICAL_KEYPOINTS, SCHEMES, Scheme
 from preface.align.keypoints3d import Keypoints, eye_distance, form_keypoints, inside_out, no_keypoints
+from preface.align.landmark_bias import Expected, LandmarkBias, expect, pixel_shifts
 from preface.align.landmarks import NoFace, ViewLandmarks
 from preface.align.options import AlignmentOptions
 from preface.align.triangulation import Reason, Triangulation, triangulate
-from preface.align.view_check import Judgement, ViewVerdict, judge_views, measure
+from preface.align.view_check import Judgement, ViewVerdict, judge_views
+from preface.align.view_consensus import measure
 from preface.capture.rig import Rig
 from preface.geometry import Views
 
 # The median of the squared length of a two-dimensional standard normal vector.
 MEDIAN_SQUARE = 2 * np.log(2)
 _CONTESTED = "too few views agree on where it is"
+# Where the detector's bias is to be corrected: the factor on the tolerance while it is not, and how often the face that
+# it is corrected for is found anew. The correction varies by 0.2% of the eye distance for each degree of the face's
+# turn, and the first face is right to some degrees.
+LOOSE, CORRECTIONS = 2.0, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +62,10 @@ class SubjectAlignment:
 
 
 def align_subject(
-    landmarks: Mapping[str, ViewLandmarks | NoFace], rig: Rig, options: AlignmentOptions
+    landmarks: Mapping[str, ViewLandmarks | NoFace],
+    rig: Rig,
+    options: AlignmentOptions,
+    bias: LandmarkBias | None = None,
 ) -> SubjectAlignment:
     """Judge the views, triangulate the landmarks and form the five keypoints.
 
@@ -61,6 +73,7 @@ def align_subject(
         landmarks: camera id to what was found in that view; all of one scheme.
         rig: the cameras, of images of the size in which the landmarks were found.
         options: see `AlignmentOptions`.
+        bias: of the detector that found the landmarks; landmarks of another scheme are left as they are.
 
     Raises:
         AlignmentError: views of different schemes, or landmarks that do not fit their scheme.
@@ -83,24 +96,109 @@ def align_subject(
     cameras = _stack(rig, list(seen))
     pixels = np.stack([view.pixels for view in seen.values()]).astype(np.float64)
     widths = [rig.cameras[camera].camera.width for camera in seen]
-    measured = measure(scheme, cameras, widths, pixels)
-    judged = judge_views(measured, options.view_tolerance, options.triangulation)
-    verdicts |= dict(zip(seen, judged.verdicts, strict=True))
+    looked = _Looked(scheme, cameras, widths, pixels)
+    known = bias if bias is not None and bias.scheme == scheme.name else None
+    looked, judged = _judge(looked, known, options)
+    verdicts |= dict(zip(seen, _with_corrections(judged.verdicts, looked), strict=True))
     ordered = {camera: verdicts[camera] for camera in landmarks}
     used = np.flatnonzero(judged.kept.any(1))
     if len(used) < 2:
         return _excluded(scheme, ordered, _too_few_views(ordered))
 
     names = [list(seen)[index] for index in used]
-    cameras, pixels = cameras[used], _without_left_out(scheme, pixels, judged)[used]
-    sigmas = _deviations(cameras, [seen[name] for name in names], judged.points, options.landmark_error)
+    cameras, pixels = cameras[used], _without_left_out(scheme, looked.corrected, judged)[used]
+    shares = looked.shares(options.landmark_error)[used]
+    sigmas = _deviations(cameras, [seen[name] for name in names], judged.points, shares)
     points, sigmas, scale = _triangulate(cameras, pixels, sigmas, options)
     keypoints = form_keypoints(scheme, cameras, points, sigmas, options)
-    contested = np.logical_and(np.any(measured.seen[used], axis=0), ~np.any(judged.kept, axis=0))
+    some = np.isfinite(looked.corrected_keypoints[used]).all(-1).any(0)
+    contested = np.logical_and(some, ~np.any(judged.kept, axis=0))
     reasons = [_CONTESTED if no else why for no, why in zip(contested, keypoints.reasons, strict=True)]
     keypoints = replace(keypoints, reasons=tuple(reasons))
     excluded = _why_excluded(keypoints, options.minimum_keypoints)
     return SubjectAlignment(scheme.name, tuple(names), points, keypoints, ordered, scale, excluded)
+
+
+@dataclass(frozen=True, eq=False)
+class _Looked:
+    """Landmarks [V, N, 2] of V views, and what their detector's bias does to them, as far as that is known.
+
+    Attributes:
+        scheme, cameras, widths, pixels: as found.
+        expected: None where nothing is corrected.
+        shifts: [V, N, 2] pixels, to be added to the landmarks.
+    """
+
+    scheme: Scheme
+    cameras: Views
+    widths: Sequence[int]
+    pixels: np.ndarray
+    expected: Expected | None = None
+    shifts: np.ndarray | float = 0.0
+
+    def knowing(self, expected: Expected) -> _Looked:
+        """The same landmarks, corrected by what is expected of their detector."""
+        return replace(self, expected=expected, shifts=pixel_shifts(expected, self.cameras))
+
+    @property
+    def corrected(self) -> np.ndarray:
+        """Landmarks [V, N, 2] without the bias."""
+        return self.pixels + self.shifts
+
+    @property
+    def keypoint_shifts(self) -> np.ndarray:
+        """Shifts [V, 5, 2] of the keypoints."""
+        return self.scheme.keypoint_pixels(np.broadcast_to(self.shifts, self.pixels.shape))
+
+    @property
+    def corrected_keypoints(self) -> np.ndarray:
+        """Keypoints [V, 5, 2] without the bias."""
+        return self.scheme.keypoint_pixels(self.corrected)
+
+    def shares(self, usual: float) -> np.ndarray:
+        """Deviation [V, N] of each landmark beyond the detector's own, in eye distances."""
+        if self.expected is None:
+            return np.full(self.pixels.shape[:2], usual)
+        return self.expected.deviations / self.expected.eye_distance
+
+    def judge(self, tolerance: float, options: AlignmentOptions) -> Judgement:
+        """Judge the views; see `judge_views`."""
+        shares = self.shares(options.landmark_error)
+        members = [list(self.scheme.keypoints[name]) for name in CANONICAL_KEYPOINTS]
+        deviations = np.stack([shares[:, some].max(1) for some in members], axis=1)
+        measured = measure(
+            self.scheme, self.cameras, self.widths, self.pixels, self.keypoint_shifts, deviations
+        )
+        return judge_views(measured, tolerance, options.credible_deviation, options.triangulation)
+
+
+def _judge(
+    looked: _Looked, bias: LandmarkBias | None, options: AlignmentOptions
+) -> tuple[_Looked, Judgement]:
+    """Judge the views, with the detector's bias taken out where it is known and the views show a face."""
+    if bias is not None:
+        judged = looked.judge(LOOSE * options.view_tolerance, options)
+        for _ in range(CORRECTIONS):
+            expected = expect(bias, judged.points, looked.cameras.world_from_camera[:, :, 3])
+            if expected is None or inside_out(judged.points):
+                return looked, looked.judge(options.view_tolerance, options)
+            corrected = looked.knowing(expected)
+            judged = corrected.judge(options.view_tolerance, options)
+            if not judged.kept.any():
+                break
+            looked = corrected
+        if judged.kept.any():
+            return looked, judged
+    return looked, looked.judge(options.view_tolerance, options)
+
+
+def _with_corrections(verdicts: Sequence[ViewVerdict], looked: _Looked) -> list[ViewVerdict]:
+    if looked.expected is None:
+        return list(verdicts)
+    return [
+        replace(verdict, correction=shifts)
+        for verdict, shifts in zip(verdicts, looked.keypoint_shifts, strict=True)
+    ]
 
 
 def _why_excluded(keypoints: Keypoints, minimum: int) -> str | None:
@@ -179,8 +277,10 @@ def _without_left_out(scheme: Scheme, pixels: np.ndarray, judged: Judgement) -> 
     return pixels
 
 
-def _deviations(cameras: Views, found: Sequence[ViewLandmarks], face: np.ndarray, share: float) -> np.ndarray:
-    """Standard deviations [N, V] in pixels: the detector's, and a share of the face's size in the image."""
+def _deviations(
+    cameras: Views, found: Sequence[ViewLandmarks], face: np.ndarray, shares: np.ndarray
+) -> np.ndarray:
+    """Standard deviations [N, V] in pixels: the detector's, and shares [V, N] of the face's size in the image."""
     own = np.stack([view.sigma for view in found], axis=-1).astype(np.float64)
     known = face[np.isfinite(face).all(-1)]
     rotation, centre = cameras.world_from_camera[:, :, :3], cameras.world_from_camera[:, :, 3]
@@ -189,7 +289,7 @@ def _deviations(cameras: Views, found: Sequence[ViewLandmarks], face: np.ndarray
     size = eye_distance(face)
     if not np.isfinite(size):
         size = np.linalg.norm(known[:, None] - known, axis=-1).max()
-    return np.hypot(own, share * size * focal / depth)
+    return np.hypot(own, shares.T * size * focal / depth)
 
 
 def _triangulate(

@@ -4,8 +4,9 @@ A header is read and judged before any pixel is decoded: a PNG of 255 KB can dec
 reads headers, OpenCV decodes (it keeps 16 bits, and its in-memory decoders refuse truncated files), and
 OpenEXR does EXR.
 
-EXIF orientation: never applied and never ignored. A file whose tag asks for a rotation is refused,
-because a calibration and a photograph that disagree about it give wrong geometry without any sign.
+EXIF orientation: never applied here and never ignored. A file whose tag asks for a rotation is refused,
+because a calibration and a photograph that disagree about it give wrong geometry without any sign. Where no
+calibration can disagree, as with photographs of one phone, `preface.capture.upright` reads them turned.
 
 Colours are returned as they are encoded in the file: sRGB for PNG, JPEG and TIFF, linear for EXR.
 """
@@ -50,12 +51,14 @@ class ImageHeader:
         width: in pixels.
         height: in pixels.
         channels: 1 (grey), 3 (RGB) or 4 (RGBA); for EXR the number of named channels.
+        orientation: EXIF's, 1 to 8; 1 is upright, and what a file without it is.
     """
 
     format: str
     width: int
     height: int
     channels: int
+    orientation: int = 1
 
 
 def read_header(path: str | os.PathLike[str]) -> ImageHeader:
@@ -63,6 +66,17 @@ def read_header(path: str | os.PathLike[str]) -> ImageHeader:
 
     Raises:
         ImageError: not a supported image, too large, or to be rotated according to EXIF.
+    """
+    header = stored_header(path)
+    _check_upright(path, header.orientation)
+    return header
+
+
+def stored_header(path: str | os.PathLike[str]) -> ImageHeader:
+    """Read an image's header, whatever EXIF says of its orientation; width and height are those of the file.
+
+    Raises:
+        ImageError: not a supported image, or too large.
     """
     try:
         with Path(path).open("rb") as file:
@@ -88,20 +102,33 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     Raises:
         ImageError: as `read_header`; or truncated, corrupt, or EXR channels other than those.
     """
-    header = read_header(path)
+    return decode(path, read_header(path))
+
+
+def decode(path: str | os.PathLike[str], header: ImageHeader) -> np.ndarray:
+    """Decode an image as it is stored; ``header`` is its own.
+
+    Raises:
+        ImageError: as `read_image`, but for the orientation in the header.
+    """
     if header.format == "EXR":
         return _colour_channels(path, read_exr(path))
     import cv2
 
-    # UNCHANGED: neither reduced to 8 bits nor rotated.
+    # Neither reduced to 8 bits nor rotated; in RGB where the decoder is right about it (TIFF's is not).
+    in_order = header.channels == 3 and header.format in ("JPEG", "PNG")
+    kept = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         encoded = Path(path).read_bytes()
     except OSError as error:
         raise ImageError.from_os(path, "file", error) from error
     try:
         if header.format == "PNG":
-            _check_upright(path, _late_png_exif(encoded))
-        pixels = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
+            late = _orientation(_late_png_exif(encoded))
+            if late != header.orientation:
+                _check_upright(path, late)
+        flags = kept if in_order else cv2.IMREAD_UNCHANGED
+        pixels = cv2.imdecode(np.frombuffer(encoded, np.uint8), flags)
     except (cv2.error, *_PILLOW_ERRORS) as error:
         raise _corrupt(path, str(error)) from error
     expected = (header.height, header.width, header.channels)
@@ -111,8 +138,10 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     if pixels.shape != expected or pixels.dtype not in (np.uint8, np.uint16):
         problem = f"decodes to {pixels.shape} {pixels.dtype}, but the header says {expected}"
         raise ImageError(path, "pixels", problem, "Export the image again with 8 or 16 bits per channel")
-    order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[header.channels]  # OpenCV's is BGR
-    return np.ascontiguousarray(pixels[..., order])
+    if header.channels == 1 or in_order:
+        return pixels
+    to_rgb = cv2.COLOR_BGR2RGB if header.channels == 3 else cv2.COLOR_BGRA2RGBA
+    return cv2.cvtColor(pixels, to_rgb, dst=pixels)
 
 
 def read_exr(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
@@ -282,8 +311,7 @@ def _pillow_header(path: str | os.PathLike[str], magic: bytes, file: io.Buffered
         raise ImageError(
             path, "header", f"holds {frames} images", "Export the one that is meant as a file of its own"
         )
-    _check_upright(path, exif)
-    return _checked(path, ImageHeader(str(image.format), *image.size, channels))
+    return _checked(path, ImageHeader(str(image.format), *image.size, channels, _orientation(exif)))
 
 
 def _exr_header(path: str | os.PathLike[str], file: io.BufferedReader) -> ImageHeader:
@@ -305,12 +333,17 @@ def _exr_header(path: str | os.PathLike[str], file: io.BufferedReader) -> ImageH
     return _checked(path, ImageHeader("EXR", right - left + 1, bottom - top + 1, len(parts[0]["channels"])))
 
 
-def _check_upright(path: str | os.PathLike[str], exif: Mapping[int, Any]) -> None:
+def _orientation(exif: Mapping[int, Any]) -> int:
     orientation = exif.get(_EXIF_ORIENTATION, 1)
-    if orientation not in (0, 1):  # 0 is what cameras write that do not know
+    return 1 if orientation == 0 else orientation  # 0 is what cameras write that do not know
+
+
+def _check_upright(path: str | os.PathLike[str], orientation: int) -> None:
+    if orientation != 1:
         problem = f"is {orientation}, which asks for a rotation or mirroring"
         remedy = (
-            "Rotate the pixels, or remove the tag (exiftool -Orientation= FILE), in calibration images alike"
+            "Turn the pixels (mogrify -auto-orient FILE) or remove the tag (exiftool -Orientation= FILE), in the "
+            "calibration's images and the photographs alike"
         )
         raise ImageError(path, "EXIF orientation", problem, remedy)
 

@@ -32,11 +32,12 @@ from preface.align.template import build_template, require_same_scheme
 from preface.align.triangulation import Reason, Triangulation
 from preface.align.view_check import ViewVerdict
 from preface.artifacts import ArtifactError, provenance
-from preface.capture.images import IMAGE_SUFFIXES, displayable, read_header, read_image
+from preface.capture.images import IMAGE_SUFFIXES, displayable
 from preface.capture.photos.files import Photograph, find_photographs
 from preface.capture.rig import read_rig, write_rig
+from preface.capture.upright import read_upright, read_upright_header
 from preface.cli.align_folder import forget
-from preface.cli.align_landmarks import Landmarks, landmarks_of, make_folder
+from preface.cli.align_landmarks import UPRIGHT, Landmarks, landmarks_of, make_folder
 from preface.cli.output import say
 from preface.cli.usage import UsageError
 from preface.plain_words import suggestion
@@ -55,9 +56,10 @@ def run(config: argparse.Namespace) -> list[str]:
         require_same_scheme(given, [SCHEME])
     if config.metric_cameras and cameras is None:
         raise UsageError("--metric-cameras speaks of the cameras that --cameras gives, and there are none")
-    options = PhotoOptions(known_distance=_known_distance(config), metric_cameras=config.metric_cameras)
+    known = _known_distance(config)
     make_folder(config.output)
-    landmarks = landmarks_of(config, {(identity, photo.id): photo.path for photo in photographs})
+    files = {(identity, photo.id): photo.path for photo in photographs}
+    landmarks = landmarks_of(config, files, UPRIGHT)
     views = [
         PhotoView(photo.id, entry, photo.width, photo.height, photo.exif_focal)
         for photo in photographs
@@ -68,6 +70,7 @@ def run(config: argparse.Namespace) -> list[str]:
         raise ArtifactError(
             config.source, "photographs", problem, "Give photographs of a face from the front"
         )
+    options = PhotoOptions(known_distance=known, metric_cameras=config.metric_cameras, bias=landmarks.bias)
     began = time.perf_counter()
     found = align_photos(views, cameras, options)
     say(f"aligned in {time.perf_counter() - began:.1f} s")
@@ -126,14 +129,14 @@ def _photographs(config: argparse.Namespace) -> list[Photograph]:
         raise ArtifactError(
             config.source, "photographs", problem, "Give one to seven photographs of one person"
         )
-    return [_single(files[0])] if len(files) == 1 else find_photographs(files, "one")
+    return [_single(files[0])] if len(files) == 1 else find_photographs(files, "one", read_upright_header)
 
 
 def _single(file: Path) -> Photograph:
     """A photograph on its own, which `find_photographs` refuses: a calibration needs two."""
     import pycolmap
 
-    header = read_header(file)
+    header = read_upright_header(file)
     camera = None if header.format == "EXR" else pycolmap.infer_camera_from_image(file)
     focal = float(camera.mean_focal_length()) if camera and camera.has_prior_focal_length else None
     name = re.sub(r"[^A-Za-z0-9._-]", "_", file.stem)[:90]
@@ -231,7 +234,7 @@ def _write(
 
     def load_image(_: str, name: str) -> np.ndarray | None:
         try:
-            return displayable(read_image(files[name]))
+            return displayable(read_upright(files[name]))
         except ArtifactError:  # the photograph's reason says so
             return None
 

@@ -19,6 +19,7 @@ from preface.align.alignment_files import (
     write_template,
 )
 from preface.align.errors import AlignmentError
+from preface.align.landmark_bias import LandmarkBias
 from preface.align.landmarks import NoFace, ViewLandmarks
 from preface.align.options import AlignmentOptions
 from preface.align.person_file import Alignment, write_alignment
@@ -59,7 +60,8 @@ def run(config: argparse.Namespace) -> list[str]:
         for subject in subjects
         for camera in capture.manifest.cameras
     }
-    studio = align_people(subjects, {take: entry.rig for take, entry in rigs.items()}, found, given, options)
+    cameras = {take: entry.rig for take, entry in rigs.items()}
+    studio = align_people(subjects, cameras, found, given, options, landmarks.bias)
     for note in (*notes, *_notes(studio, options)):
         say(f"note: {note}")
     return _write(config, studio, subjects, capture, _history(config, capture, rigs, landmarks), landmarks)
@@ -86,6 +88,7 @@ def align_people(
     found: Mapping[tuple[str, str], ViewLandmarks | NoFace],
     given: Template | None,
     options: AlignmentOptions,
+    bias: LandmarkBias | None = None,
 ) -> AlignedStudio:
     """Triangulate everybody, make the template unless one is given, and place everybody on it.
 
@@ -95,12 +98,13 @@ def align_people(
         found: (identity, camera) to what is in the view.
         given: an existing template.
         options: see `AlignmentOptions`.
+        bias: of the detector that found the landmarks; None leaves them as they are.
 
     Raises:
         AlignmentError: landmarks of another scheme than the given template's.
     """
     faces = {
-        subject.id: align_subject(_views_of(subject.id, found), rigs[subject.take], options)
+        subject.id: align_subject(_views_of(subject.id, found), rigs[subject.take], options, bias)
         for subject in subjects
     }
     usable = {identity: face for identity, face in faces.items() if face.excluded is None}

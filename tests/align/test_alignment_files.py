@@ -28,6 +28,7 @@ from preface.align.template import build_template
 from preface.artifacts import SCHEMA_DIRECTORY, ArtifactError, provenance
 
 OPTIONS = AlignmentOptions()
+SHIFTS = [(1.25, -0.5), (0.0, 0.125), (-3.5, 2.0), (0.75, 0.0), (0.0, 0.0)]
 
 
 def example(name):
@@ -49,6 +50,8 @@ def a_person(count=3):
     pixels[5] = np.nan
     found["cam01"] = of_pixels(pixels)
     subject = align_subject(found, rig(poses), OPTIONS)
+    shifted = {name: replace(v, correction=np.array(SHIFTS)) for name, v in subject.views.items() if v.used}
+    subject = replace(subject, views={**subject.views, **shifted})
     placement = place_subject(subject.keypoints, a_template(), OPTIONS)
     return Alignment("id0000", "take00", subject, placement, found, provenance({}, {}), {"note": 2})
 

@@ -2,21 +2,26 @@
 
 import numpy as np
 import pytest
-from cameras_around import LENS, arc, stack
+from cameras_around import LENS, arc, looking_at_origin, stack
 from faces import EYE_DISTANCE, flipped, landmarks, swapped, views
 
 from preface.align.keypoints import IBUG68
 from preface.align.options import TriangulationOptions
-from preface.align.view_check import judge_views, measure
+from preface.align.view_check import judge_views
+from preface.align.view_consensus import measure
 
-TOLERANCE = 0.03
+TOLERANCE, CREDIBLE = 0.03, 0.02
 ELSEWHERE = np.array([0.3, 0.05, -0.3])  # where another person stands
 
 
 def judged(found, poses):
     pixels = np.stack([view.pixels for view in found.values()])
-    measured = measure(IBUG68, stack(poses), [LENS.width] * len(poses), pixels)
-    return judge_views(measured, TOLERANCE, TriangulationOptions())
+    count = len(poses)
+    deviations = np.full((count, 5), 0.01)
+    measured = measure(
+        IBUG68, stack(poses), [LENS.width] * count, pixels, np.zeros((count, 5, 2)), deviations
+    )
+    return judge_views(measured, TOLERANCE, CREDIBLE, TriangulationOptions())
 
 
 def seen(poses, seed=0):
@@ -155,3 +160,10 @@ def test_a_hidden_keypoint_is_no_disagreement():
     assert codes(judgement) == ["agrees"] * 5
     assert judgement.verdicts[0].left_out == ("left_eye_outer",)
     assert np.isnan(judgement.verdicts[0].disagreement[1])
+
+
+def test_views_from_almost_one_direction_leave_the_depth_open():
+    poses = [looking_at_origin(0), looking_at_origin(1.2)]
+    judgement = judged(views(landmarks(), poses), poses)
+    assert codes(judgement) == ["disagrees"] * 2
+    assert not judgement.kept.any()

@@ -189,7 +189,7 @@ def test_an_interrupted_search_is_resumed_and_repeated_only_where_something_chan
     rig, searched = made.rig(CAMERAS, ANGLES, "monday"), []
     patience = [7]  # photographs until the user interrupts
 
-    def detect(images, options, done):
+    def detect(images, options, done, read):
         found = {}
         for person, camera in images:
             if len(searched) == patience[0]:
@@ -384,3 +384,14 @@ def test_help_comes_at_once():
     assert result.returncode == 0, result.stderr
     assert "--landmark-model" in result.stdout
     assert time.process_time() - began < 5
+
+
+def test_the_correction_of_facemesh_is_not_for_landmarks_of_another_detector(capture, capsys):
+    assert align(capture, "--landmark-bias", "on") == 2
+    assert "--landmark-bias on is for landmarks of facemesh478: these are ibug68" in capsys.readouterr().err
+    assert align(capture, "--landmark-bias", "auto") == 0
+    assert all("correction" not in view for view in of(capture, "anna")["views"].values())
+    assert (
+        load_json(capture.parent / "alignment" / "alignment.json")["provenance"]["config"]["landmark_bias"]
+        is None
+    )

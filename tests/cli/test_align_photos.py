@@ -3,9 +3,11 @@
 import made_up_studio as made
 import numpy as np
 import pytest
+from PIL import Image
 
 from preface.align.alignment_files import read_index, read_template
 from preface.align.keypoints import CANONICAL_KEYPOINTS, FACEMESH478
+from preface.align.landmark_bias import shipped_bias
 from preface.align.landmark_files import landmark_file, write_landmarks
 from preface.align.landmarks import NoFace, ViewLandmarks, box_around
 from preface.align.person_file import read_alignment
@@ -97,6 +99,29 @@ def test_a_photograph_without_a_face_is_left_out_with_its_reason(folder, monkeyp
     assert capsys.readouterr().out.startswith("1 of 2 photographs used")
     view = read_alignment(folder.parent / "alignment" / "me.json").subject.views["b"]
     assert (view.used, view.code, view.reason) == (False, "no_face", "it shows a dog")
+
+
+def test_photographs_that_exif_wants_turned_are_turned(folder, monkeypatch):
+    monkeypatch.setattr("preface.cli.align_photos.photo_report", lambda *_: Report("light", {}))
+    assert align(folder, "--output", folder.parent / "stored") == 0
+    for file in folder.glob("*.png"):
+        exif = Image.Exif()
+        exif[0x0112] = 6  # the stored pixels are to be turned clockwise by a quarter
+        Image.new("RGB", made.SIZE[::-1]).save(file, exif=exif)
+    assert align(folder, "--output", folder.parent / "turned") == 0
+    stored, turned = (read_rig(folder.parent / name) for name in ("stored", "turned"))
+    for name in stored.cameras:
+        camera = turned.cameras[name].camera
+        assert (camera.width, camera.height) == made.SIZE
+        np.testing.assert_array_equal(camera.params, stored.cameras[name].camera.params)
+
+
+def test_the_correction_of_landmarks_is_recorded_when_it_is_asked_for(folder, monkeypatch):
+    monkeypatch.setattr("preface.cli.align_photos.photo_report", lambda *_: Report("light", {}))
+    for choice, recorded in (("off", None), ("on", shipped_bias().name)):
+        assert align(folder, "--only", "a", "--landmark-bias", choice) == 0
+        history = read_index(folder.parent / "alignment").provenance
+        assert history["config"]["landmark_bias"] == recorded
 
 
 @pytest.mark.parametrize(

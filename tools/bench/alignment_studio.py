@@ -15,7 +15,7 @@ Keypoints of calibrated rigs are carried into the studio's frame as `alignment_t
 import argparse
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -46,10 +46,10 @@ class Run:
     rigs: Path
     folder: Path
 
-    def make(self, landmarks: Path | None) -> None:
+    def make(self, landmarks: Path | None, bias: str) -> None:
         """Run the command; found landmarks in the folder are used again."""
         arguments = ["studio", str(self.truth.studio / "capture"), "--rig", str(self.rigs)]
-        arguments += ["--output", str(self.folder)]
+        arguments += ["--output", str(self.folder), "--landmark-bias", bias]
         if landmarks is not None:
             arguments += ["--landmarks", str(landmarks)]
         if preface_align(arguments) != 0:
@@ -90,11 +90,13 @@ def main() -> None:
     parser.add_argument("--again", type=Path, help="the same studio in another exposure")
     parser.add_argument("--again-rigs", type=Path, help="its calibrated rigs")
     parser.add_argument("--work", type=Path, help="where alignments go (default: STUDIO/alignment_bench)")
+    parser.add_argument("--landmark-bias", choices=("auto", "on", "off"), default="auto")
     parser.add_argument("--json", type=Path, help="also write the figures here")
     arguments = parser.parse_args()
     work = arguments.work or arguments.studio / "alignment_bench"
-    first = _runs("first", arguments.studio, arguments.rigs, work)
-    again = _runs("again", arguments.again, arguments.again_rigs, work) if arguments.again else []
+    bias = arguments.landmark_bias
+    first = _runs("first", arguments.studio, arguments.rigs, work, bias)
+    again = _runs("again", arguments.again, arguments.again_rigs, work, bias) if arguments.again else []
     figures: dict[str, Any] = {run.name: _judged(run) for run in (*first, *again)}
     detector = _detector(first[0])
     print("\nlandmarks of all views against the truth, median, % of the eye distance")
@@ -109,14 +111,14 @@ def main() -> None:
         arguments.json.write_text(json.dumps(figures, indent=1) + "\n")
 
 
-def _runs(name: str, studio: Path, rigs: Path | None, work: Path) -> list[Run]:
+def _runs(name: str, studio: Path, rigs: Path | None, work: Path, bias: str) -> list[Run]:
     truth = Truth(studio)
     runs = [Run(f"{name}-true", truth, studio / "truth" / "takes", work / f"{name}-true")]
     if rigs is not None:
         runs.append(Run(f"{name}-calibrated", truth, rigs, work / f"{name}-calibrated"))
     work.mkdir(parents=True, exist_ok=True)
     for index, run in enumerate(runs):
-        run.make(runs[0].folder / "landmarks" if index else None)
+        run.make(runs[0].folder / "landmarks" if index else None, bias)
     return runs
 
 
@@ -125,7 +127,8 @@ def _judged(run: Run) -> dict[str, Any]:
     index = read_index(run.folder)
     errors = np.array([run.keypoints[name] - run.truth.keypoints[name] for name in run.keypoints])
     views = np.array([len(alignment.subject.cameras) for alignment in run.alignments.values()])
-    claimed, true = _errors_of_used_views(run)
+    claimed, each = _errors_of_used_views(run)
+    true = np.array([_worst(of_view) for of_view in each])
     rows = error_rows(errors)
     figures = {
         "people": len(run.alignments),
@@ -137,6 +140,8 @@ def _judged(run: Run) -> dict[str, Any]:
         "worst accepted keypoint against the other views, % of eye distance": float(np.nanmax(claimed)),
         "worst accepted keypoint against the truth, % of eye distance": float(np.nanmax(true)),
         "used views with an accepted keypoint more than 3 % off the truth": int((true > 3).sum()),
+        "accepted keypoints": np.isfinite(each).sum(axis=0).tolist(),
+        "of these, more than 3 % off the truth": (each > 3).sum(axis=0).tolist(),
         "accepted keypoints against the truth, median of the views' worst, %": float(np.nanmedian(true)),
         "spread before (five keypoints), mm": _spread(run, canonical=False),
         "spread after (five keypoints), mm": _spread(run, canonical=True),
@@ -193,7 +198,10 @@ def _leaving_out(run: Run) -> int:
 
 
 def _errors_of_used_views(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """Worst accepted keypoint of each used view, % of the eye distance: by the other views, and by the truth.
+    """Errors of the accepted keypoints of U used views, % of the eye distance.
+
+    Returns:
+        the worst of each view by what the other views say [U]; all by the truth [U, 5], NaN where left out.
 
     The truth's is the distance between landmark and projection of the true keypoint, at the keypoint's depth.
     """
@@ -203,8 +211,13 @@ def _errors_of_used_views(run: Run) -> tuple[np.ndarray, np.ndarray]:
             verdict, landmarks = alignment.subject.views[camera], alignment.found[camera]
             assert isinstance(landmarks, ViewLandmarks)
             accepted = np.array([name not in verdict.left_out for name in CANONICAL_KEYPOINTS])
+            if verdict.correction is not None:
+                pixels = landmarks.pixels.copy()
+                for name, shift in zip(CANONICAL_KEYPOINTS, verdict.correction, strict=True):
+                    pixels[list(landmarks.layout.keypoints[name])] += shift
+                landmarks = replace(landmarks, pixels=pixels)
             offsets = np.linalg.norm(_offsets(run, identity, camera, landmarks), axis=-1)
-            found.append(_worst(offsets[accepted]))
+            found.append(np.where(accepted, offsets, np.nan))
             claimed.append(_worst(100 * verdict.disagreement[accepted]))
     return np.array(claimed), np.array(found)
 

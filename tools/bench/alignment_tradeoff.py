@@ -38,6 +38,7 @@ from preface.align.detection import DetectionOptions
 from preface.align.face_search import find_landmarks
 from preface.align.facemesh import FaceModels
 from preface.align.keypoints import CANONICAL_KEYPOINTS
+from preface.align.landmark_bias import shipped_bias
 from preface.align.landmarks import NoFace, ViewLandmarks
 from preface.align.options import AlignmentOptions
 from preface.align.subject import SubjectAlignment, align_subject
@@ -159,7 +160,7 @@ def _faces(truth: Truth, measured: Measured) -> tuple[dict[str, SubjectAlignment
     """Faces by identity, and CPU seconds per person."""
     began, options = time.process_time(), AlignmentOptions()
     faces = {
-        identity: align_subject(views, truth.rigs[truth.takes[identity]], options)
+        identity: align_subject(views, truth.rigs[truth.takes[identity]], options, shipped_bias())
         for identity, views in measured.views.items()
     }
     return faces, (time.process_time() - began) / len(faces)

@@ -10,8 +10,10 @@ import numpy as np
 
 from preface.align.errors import AlignmentError
 from preface.align.keypoints import CANONICAL_KEYPOINTS
+from preface.align.landmark_bias import LandmarkBias, expect, pixel_shifts
 from preface.align.photos import trust
 from preface.align.photos.adjustment import LensPrior, adjust
+from preface.align.photos.correction import corrected
 from preface.align.photos.face import face_prior, keypoint_weights
 from preface.align.photos.initial import Affine, ViewProblemError, first_pose
 from preface.align.photos.measure import face_points
@@ -50,7 +52,11 @@ def triangulate_given(views: Sequence[PhotoView], rig: Rig, options: PhotoOption
     if not used:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in excluded.items())
         raise AlignmentError(f"no photograph can be used ({reasons}); give the cameras of these photographs")
-    face = _triangulated(used, poses, rig) if len(used) > 1 else _matched(used[0], poses[0], rig)
+    several = len(used) > 1
+    face = _triangulated(used, poses, rig) if several else _matched(used[0], poses[0], rig, options.bias)
+    if several and options.bias is not None:
+        used = _corrected(used, face, rig, options.bias)
+        face = _triangulated(used, poses, rig)
     if np.isfinite(face.points).all(-1).sum() < 3:
         raise AlignmentError(
             "the landmarks cannot be triangulated with these cameras: they see the face from almost one direction, "
@@ -149,17 +155,34 @@ def _triangulated(views: list[PhotoView], poses: list[Affine], rig: Rig) -> _Fac
     sigma = np.hypot(own, shared) * focals[:, None]
     pixels = np.stack([view.landmarks.pixels for view in views])
     pixels = np.where(observations.seen[..., None], pixels, np.nan)
-    cameras = [rig.cameras[view.id] for view in views]
-    stacked = Views.stack([c.camera for c in cameras], [c.camera_from_rig.inverse for c in cameras])
-    found = triangulate(stacked, np.swapaxes(pixels, 0, 1), sigma.T)
+    found = triangulate(_stacked(views, rig), np.swapaxes(pixels, 0, 1), sigma.T)
     return _Face(found.points, found.covariance, found.inliers.T, found.residuals.T)
 
 
-def _matched(view: PhotoView, pose: Affine, rig: Rig) -> _Face:
+def _corrected(views: list[PhotoView], face: _Face, rig: Rig, bias: LandmarkBias) -> list[PhotoView]:
+    """The photographs without what the detector gets wrong on a face that is about known."""
+    cameras = _stacked(views, rig)
+    expected = expect(bias, _five(face.points), cameras.world_from_camera[:, :, 3])
+    if expected is None:
+        return views
+    return [
+        replace(view, landmarks=replace(view.landmarks, pixels=view.landmarks.pixels + shifts))
+        for view, shifts in zip(views, pixel_shifts(expected, cameras), strict=True)
+    ]
+
+
+def _stacked(views: list[PhotoView], rig: Rig) -> Views:
+    cameras = [rig.cameras[view.id] for view in views]
+    return Views.stack([c.camera for c in cameras], [c.camera_from_rig.inverse for c in cameras])
+
+
+def _matched(view: PhotoView, pose: Affine, rig: Rig, bias: LandmarkBias | None) -> _Face:
     """The most probable face before one camera."""
     face = face_prior()
     observations, scene = _observations([view], [pose], rig)
     fit = adjust(observations, face, LensPrior(0.0, 0.0), scene)
+    if bias is not None:
+        fit = adjust(corrected(observations, fit.scene, face, bias), face, LensPrior(0.0, 0.0), fit.scene)
     camera = rig.cameras[view.id]
     face_from_camera = Rigid(fit.scene.rotation[0], fit.scene.translations()[0]).inverse
     rig_from_face = camera.camera_from_rig.inverse @ face_from_camera.inverse

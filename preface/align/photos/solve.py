@@ -7,6 +7,7 @@ import numpy as np
 
 from preface.align.keypoints import FACEMESH478
 from preface.align.photos.adjustment import Adjusted, LensPrior, adjust
+from preface.align.photos.correction import corrected
 from preface.align.photos.face import FacePrior, face_prior
 from preface.align.photos.initial import ViewProblemError, first_pose
 from preface.align.photos.noise import Observations
@@ -36,7 +37,7 @@ class Solution:
         adjusted: cameras, face and covariance.
         face: the expected face whose coefficients ``adjusted`` holds.
         used: indices of the views in ``adjusted``.
-        observations: of the used views.
+        observations: of the used views, corrected.
         lens: what was believed about the lens.
         focal_source: "exif" or "expectation".
         excluded: reasons by view id.
@@ -64,14 +65,18 @@ def solve(views: Sequence[PhotoView], options: PhotoOptions) -> Solution | dict[
     free = adjust(observations.views(used), coarse, expected, start)
     free, used, odd = _without_odd_views(views, observations, coarse, expected, free, used)
     excluded |= odd
+    found = observations.views(used)
+    observations = corrected(found, free.scene, coarse, options.bias)
+    if options.bias is not None:
+        free = adjust(observations, coarse, expected, free.scene)
     lens, source, warnings = _believed(views, used, options, expected, free)
-    observations = observations.views(used)
     fit = (
         free
         if lens == expected
         else adjust(observations, coarse, lens, replace(free.scene, log_focal=lens.log_focal))
     )
     lens, fit = _distortion(observations, coarse, lens, fit)
+    observations = corrected(found, fit.scene, coarse, options.bias)
     shape = np.concatenate([fit.scene.shape, np.zeros(face.basis.shape[-1] - COARSE)])
     final = adjust(observations, face, lens, replace(fit.scene, shape=shape))
     return Solution(final, face, tuple(used), observations, lens, source, excluded, tuple(warnings))

@@ -8,6 +8,7 @@ import numpy as np
 
 from preface.align.errors import AlignmentError
 from preface.align.keypoints import CANONICAL_KEYPOINTS, FACEMESH478
+from preface.align.landmark_bias import LandmarkBias
 from preface.align.landmarks import ViewLandmarks
 from preface.align.photos.noise import Observations
 from preface.capture.rig import Rig
@@ -52,6 +53,7 @@ class PhotoOptions:
             (of the logarithm). Main and selfie cameras of phones have 0.65 to 1, their films 0.8 to 1.1, portrait
             lenses 1.5 and more.
         metric_cameras: whether the unit of given cameras is the metre; otherwise the face sets their scale.
+        bias: what the detector gets wrong by direction; None leaves landmarks as they are.
     """
 
     known_distance: tuple[str, str, float] | None = None
@@ -59,6 +61,7 @@ class PhotoOptions:
     exif_deviation: float = 0.05
     focal_prior: tuple[float, float] = (0.85, 0.30)
     metric_cameras: bool = False
+    bias: LandmarkBias | None = None
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ that EXIF wants rotated is refused. pycolmap then sees 8-bit grey copies in a te
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,12 +49,18 @@ class Photograph:
     exif_focal: float | None
 
 
-def find_photographs(images: str | os.PathLike[str] | Sequence[Path], sharing: Sharing) -> list[Photograph]:
+def find_photographs(
+    images: str | os.PathLike[str] | Sequence[Path],
+    sharing: Sharing,
+    header_of: Callable[[Path], ImageHeader] = read_header,
+) -> list[Photograph]:
     """List photographs, read their headers, and group them by camera.
 
     Args:
         images: a folder (its image files; with ``sharing="folder"`` those of its subfolders), or files.
         sharing: ``one`` camera took all, one per ``folder``, or ``each`` photograph has its own.
+        header_of: reads the header of a file; `preface.capture.upright.read_upright_header` where photographs are
+            turned as EXIF says.
 
     Returns:
         At least two photographs, in the order of their names or as given.
@@ -73,7 +79,7 @@ def find_photographs(images: str | os.PathLike[str] | Sequence[Path], sharing: S
     if len(paths) > MAX_PHOTOGRAPHS:
         remedy = f"Choose up to {MAX_PHOTOGRAPHS} sharp ones from all around; 100 are plenty"
         raise PhotoError(place, "photographs", f"are {len(paths)}, all to be compared in pairs", remedy)
-    headers = [read_header(path) for path in paths]
+    headers = [header_of(path) for path in paths]
     cameras = _cameras(paths, sharing)
     _check_sizes(paths, headers, cameras)
     return [
