@@ -10,20 +10,19 @@ from torch import Tensor
 
 from preface.shards.rays import RayBuffers, RayTable, form_rays
 
-# Field -> columns; everything is float32 but what is named below.
 _FIELDS = {
-    "origins": 3,
-    "directions": 3,
-    "viewdirs": 3,
-    "radii": 1,
-    "near": 1,
-    "far": 1,
-    "rgba": 4,
-    "identity": 1,
-    "view": 1,
-    "hit": 1,
+    "origins": (3, torch.float32),
+    "directions": (3, torch.float32),
+    "viewdirs": (3, torch.float32),
+    "radii": (1, torch.float32),
+    "near": (1, torch.float32),
+    "far": (1, torch.float32),
+    "rgba": (4, torch.float32),
+    "identity": (1, torch.int64),
+    "view": (1, torch.int64),
+    "hit": (1, torch.bool),
 }
-_OTHER_TYPES = {"identity": torch.int64, "view": torch.int64, "hit": torch.bool}
+_FLAT = ("identity", "view")  # [n], and not [n, 1]
 # One allocation per batch that is always of the same size, which an allocator gives back warm.
 _ALIGNMENT = 64
 
@@ -78,24 +77,24 @@ class Batch:
     @staticmethod
     def empty(rays: int, device: torch.device) -> Batch:
         """A batch with room for rays, not filled."""
-        begin, parts = 0, {}
-        for name, columns in _FIELDS.items():
-            dtype = _OTHER_TYPES.get(name, torch.float32)
-            parts[name] = (begin, rays * columns * dtype.itemsize, dtype, columns)
-            begin += math.ceil(parts[name][1] / _ALIGNMENT) * _ALIGNMENT
-        buffer = torch.empty(begin, dtype=torch.uint8, device=device)
-        fields = {
-            name: buffer[start : start + size].view(dtype).view(rays, columns)
-            for name, (start, size, dtype, columns) in parts.items()
-        }
-        fields["identity"], fields["view"] = fields["identity"].view(rays), fields["view"].view(rays)
+        spaces, end = [], 0
+        for columns, dtype in _FIELDS.values():
+            spaces.append(end)
+            end += math.ceil(rays * columns * dtype.itemsize / _ALIGNMENT) * _ALIGNMENT
+        buffer = torch.empty(end, dtype=torch.uint8, device=device)
+        # A view per type, and a field out of it at once: each call of torch takes as long as forming dozens of rays.
+        typed = {dtype: buffer.view(dtype) for dtype in (torch.float32, torch.int64, torch.bool)}
+        fields = {}
+        for begin, (name, (columns, dtype)) in zip(spaces, _FIELDS.items(), strict=True):
+            size, stride = ((rays,), (1,)) if name in _FLAT else ((rays, columns), (columns, 1))
+            fields[name] = typed[dtype].as_strided(size, stride, begin // dtype.itemsize)
         return Batch(**fields)
 
 
 def form_batch(
     table: RayTable, identity: Tensor, view: Tensor, views: int, pixel: Tensor, rgba: Tensor
 ) -> Batch:
-    """Form a batch from pixels that were gathered.
+    """Form a batch from pixels that were gathered; `preface.shards.compiled` has the compiled twin.
 
     Args:
         table: of all views of the dataset, identity by identity.
@@ -116,6 +115,6 @@ def form_batch(
     form_rays(table, identity * views + view, pixel.to(device), rays)
     batch.identity.view(pixel.shape).copy_(identity[:, None])
     batch.view.view(pixel.shape).copy_(view[:, None])
-    channels = rgba.contiguous().view(torch.uint8).to(device)
-    batch.rgba.view(-1).copy_(channels.view(-1)).div_(255)
+    channels = rgba.reshape(-1).view(torch.uint8).to(device)
+    batch.rgba.view(-1).copy_(channels).div_(255)
     return batch

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from preface.shards.batches import Batch, form_batch
 from preface.shards.reader import Dataset
+from preface.shards.routes import Route, fastest_route
 from preface.shards.samplers import Pick, Sampler
 
 Placement = Literal["device", "ram", "mmap", "auto"]
@@ -158,6 +159,10 @@ class Loader:
         scale: what lengths are multiplied with: 1 for metres, `dataset.manifest.scene_scale` for the model's units.
         rank, world: this process and how many there are.
         check: see `Pixels`.
+        compiled: False forms batches by torch even where a compiled kernel could; results are the same.
+
+    Attributes:
+        route: how batches are formed: "compiled by numba ...", or "torch" and why.
 
     Raises:
         ArtifactError: a view is damaged, a lens folds, or a file fails; at once or when it is touched.
@@ -173,6 +178,7 @@ class Loader:
         rank: int = 0,
         world: int = 1,
         check: bool = True,
+        compiled: bool = True,
     ):
         self.device = torch.device(device)
         # Apple's devices have no float64, in which rays are formed.
@@ -181,13 +187,26 @@ class Loader:
         self._table = dataset.ray_table(scale, rays_on)
         self._sampler, self._views = sampler, dataset.manifest.views
         self._rank, self._world = rank, world
+        kernels, self.route = self._choose_route(compiled)
+        self._compiled = kernels.CompiledTable(self._table) if kernels else None
+
+    def _choose_route(self, compiled: bool) -> Route:
+        """Choose between torch, which runs anywhere, and what is compiled for processors."""
+        if not compiled:
+            return Route(None, "torch (asked for)")
+        if self._table.device.type != "cpu":
+            return Route(None, f"torch (on {self._table.device})")
+        return fastest_route()
 
     def batch(self, step: int) -> Batch:
         """Form the batch of a step, now."""
         pick = self._sampler.pick(step, self._rank, self._world)
         rgba = self.pixels.gather(pick)
-        identity, view = torch.from_numpy(pick.identity), torch.from_numpy(pick.view)
-        batch = form_batch(self._table, identity, view, self._views, torch.from_numpy(pick.pixel), rgba)
+        if self._compiled:
+            batch = self._compiled.form_batch(pick.identity, pick.view, self._views, pick.pixel, rgba)
+        else:
+            identity, view, pixel = map(torch.from_numpy, (pick.identity, pick.view, pick.pixel))
+            batch = form_batch(self._table, identity, view, self._views, pixel, rgba)
         return batch if self._table.device == self.device else batch.to(self.device)
 
     def batches(self, start: int, stop: int | None = None) -> Iterator[tuple[int, Batch]]:

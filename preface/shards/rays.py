@@ -121,7 +121,7 @@ def form_rays(table: RayTable, views: Tensor, pixels: Tensor, out: RayBuffers) -
     # Gathering along rows is several times as fast as indexing columns.
     exact = table.exact.gather(1, views.expand(len(table.exact), -1)).unsqueeze(-1)  # [13, G, 1]
     columns = table.columns.gather(1, views.expand(len(table.columns), -1)).unsqueeze(-1)
-    _repeat(columns[_ORIGIN : _ORIGIN + 3, :, 0].T, out.origins.view(groups, per_group, 3))
+    _repeat(columns[ORIGIN : ORIGIN + 3, :, 0].T, out.origins.view(groups, per_group, 3))
     block = max(1, BLOCK // per_group)
     buffers = [getattr(out, field.name) for field in fields(RayBuffers)]
     for begin in range(0, groups, block):
@@ -146,7 +146,7 @@ def _form_block(table: RayTable, columns: _Columns, pixels: Tensor, out: RayBuff
         x, y, radii = _undistort(columns, x, y, table)
         out.radii.view(shape).copy_(radii)
     else:
-        out.radii.view(shape).copy_((columns.single[0] + columns.single[1]) * _RADIUS)
+        out.radii.view(shape).copy_((columns.single[0] + columns.single[1]) * RADIUS)
     directions = [x * r0 + y * r1 + r2 for r0, r1, r2 in columns.axes()]
     singles = [direction.float() for direction in directions]
     length_inverse = torch.rsqrt(singles[0] * singles[0] + singles[1] * singles[1] + singles[2] * singles[2])
@@ -162,18 +162,18 @@ def _depths(columns: _Columns, directions: list[Tensor], out: RayBuffers) -> Non
     enter = leave = None
     for axis, direction in enumerate(directions):
         inverse = direction.reciprocal()
-        one, other = columns.single[_MINIMUM + axis] * inverse, columns.single[_MAXIMUM + axis] * inverse
+        one, other = columns.single[MINIMUM + axis] * inverse, columns.single[MAXIMUM + axis] * inverse
         low, high = torch.minimum(one, other), torch.maximum(one, other)
         enter = low if enter is None else torch.maximum(enter, low)
         leave = high if leave is None else torch.minimum(leave, high)
     assert enter is not None
     assert leave is not None
-    near, far = enter.clamp_(0.0, _FINITE), leave.clamp_(-_FINITE, _FINITE)
+    near, far = enter.clamp_(0.0, FINITE), leave.clamp_(-FINITE, FINITE)
     # A product with 0 or 1 chooses without a branch per ray, which costs a processor ten times as much.
     hit = far.clone().gt_(near)
     missed = 1 - hit
-    torch.add(near * hit, columns.single[_NEAR] * missed, out=out.near.view(shape))
-    torch.add(far * hit, columns.single[_FAR] * missed, out=out.far.view(shape))
+    torch.add(near * hit, columns.single[NEAR] * missed, out=out.near.view(shape))
+    torch.add(far * hit, columns.single[FAR] * missed, out=out.far.view(shape))
     out.hit.view(shape).copy_(hit)
 
 
@@ -182,11 +182,11 @@ def _depths(columns: _Columns, directions: list[Tensor], out: RayBuffers) -> Non
 # float64: 1/fx 1/fy cx-½ cy-½, then the rotation by rows.
 _ROTATION = 4
 # float32: 1/fx 1/fy, k1 k2 p1 p2 k3 k4 k5 k6, what follows from them (see `_columns`), the camera's centre, the
-# box's faces less the centre, and the view's own depths.
-_COEFFICIENTS, _SERIES, _DERIVED = 2, 10, 12
-_ORIGIN, _MINIMUM, _MAXIMUM, _NEAR, _FAR = 19, 22, 25, 28, 29
-_FINITE, _TINY = 1e30, 1e-30  # beyond any scene, and within float32
-_RADIUS = 0.5 * 2 / math.sqrt(12)  # of the mean of two footprints
+# box's faces less the centre, and the view's own depths. `preface.shards.compiled` picks its columns by them.
+COEFFICIENTS, SERIES, DERIVED = 2, 10, 12
+ORIGIN, MINIMUM, MAXIMUM, NEAR, FAR = 19, 22, 25, 28, 29
+FINITE, _TINY = 1e30, 1e-30  # beyond any scene, and within float32
+RADIUS = 0.5 * 2 / math.sqrt(12)  # of the mean of two footprints
 
 
 class _Columns:
@@ -248,15 +248,15 @@ def _undistort(columns: _Columns, xd: Tensor, yd: Tensor, table: RayTable) -> tu
     square = xy * xy
     along_x = torch.sqrt(yy * yy + square) * columns.single[0]
     along_y = torch.sqrt(xx * xx + square) * columns.single[1]
-    return xd + dx.double(), yd + dy.double(), (along_x + along_y) * inverse * _RADIUS
+    return xd + dx.double(), yd + dy.double(), (along_x + along_y) * inverse * RADIUS
 
 
 def _series(columns: _Columns, xd: Tensor, yd: Tensor) -> tuple[Tensor, Tensor]:
     """The first terms of the displacement, right to the second power of the radial coefficients; float32."""
     c = columns.single
-    p1, p2, twice_p1, twice_p2 = c[_COEFFICIENTS + 2], c[_COEFFICIENTS + 3], c[_DERIVED], c[_DERIVED + 1]
+    p1, p2, twice_p1, twice_p2 = c[COEFFICIENTS + 2], c[COEFFICIENTS + 3], c[DERIVED], c[DERIVED + 1]
     u = xd * xd + yd * yd
-    gain = u * (c[_SERIES] + u * c[_SERIES + 1]) - (twice_p2 * xd + twice_p1 * yd)
+    gain = u * (c[SERIES] + u * c[SERIES + 1]) - (twice_p2 * xd + twice_p1 * yd)
     return gain * xd - u * p2, gain * yd - u * p1
 
 
@@ -272,8 +272,8 @@ def _newton_step(
         the step in x and in y, and the Jacobian xx, xy, yy with 1 / its determinant; float32.
     """
     c = columns.single
-    k1, k2, p1, p2, k3, k4, k5, k6 = c[_COEFFICIENTS : _COEFFICIENTS + 8]
-    twice_p1, twice_p2, four_k2, six_k3, twice_k1, four_p1, four_p2 = c[_DERIVED : _DERIVED + 7]
+    k1, k2, p1, p2, k3, k4, k5, k6 = c[COEFFICIENTS : COEFFICIENTS + 8]
+    twice_p1, twice_p2, four_k2, six_k3, twice_k1, four_p1, four_p2 = c[DERIVED : DERIVED + 7]
     x, y = xd + dx, yd + dy
     u = x * x + y * y
     radial = u * (k1 + u * (k2 + u * k3))  # less one

@@ -12,9 +12,13 @@ from functools import lru_cache
 
 import numpy as np
 
+from preface.shards.routes import fastest_route
+
 GOLDEN = 0x9E3779B97F4A7C15
 _MASK = 2**64 - 1
 PERMUTATION_KEY = int.from_bytes(b"preface1", "big")  # what permuted shards are permuted with
+# Fewer numbers are drawn by numpy in less time than it takes to import numba, steps on end.
+_WORTH_COMPILING = 1024
 
 
 def mix64(state: int) -> int:
@@ -46,7 +50,14 @@ def bits(key: int, begin: int, count: int) -> np.ndarray:
 
 
 def below(key: int, begin: int, count: int, limit: np.ndarray | int) -> np.ndarray:
-    """Whole numbers in [0, limit), int64 [count], from 53 bits each; the limits [count] are below 2^53."""
+    """Whole numbers in [0, limit), int64 [count], from 53 bits each; the limits [count] are at most 2^53."""
+    if count >= _WORTH_COMPILING and isinstance(limit, int) and (kernels := fastest_route().kernels):
+        return kernels.below(key, begin, count, limit)
+    return below_by_numpy(key, begin, count, limit)
+
+
+def below_by_numpy(key: int, begin: int, count: int, limit: np.ndarray | int) -> np.ndarray:
+    """What `below` returns, by numpy, which runs anywhere."""
     share = (bits(key, begin, count) >> np.uint64(11)).astype(np.float64)
     share *= 2.0**-53
     share *= limit

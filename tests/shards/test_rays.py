@@ -9,28 +9,46 @@ import torch
 
 from preface.geometry import Camera, Rigid, Views, cast_rays, intersect_box, pixel_centers
 from preface.shards import Dataset, Loader, Patches, SingleRays
-from preface.shards.batches import Batch
-from preface.shards.rays import LensError, RayBuffers, RayTable, form_rays
+from preface.shards.batches import form_batch
+from preface.shards.compiled import CompiledTable
+from preface.shards.rays import LensError, RayTable
 
 CPU = torch.device("cpu")
 
 
-def rays_of(camera, pose, box=small_heads.BOX, scale=1.0, pixels=None):
-    """All rays of a camera by `form_rays`."""
-    views = Views.stack([camera], [pose])
-    near_far = np.array([[0.25, 4.0]])
-    size = (camera.width, camera.height)
-    table = RayTable.build(views.intrinsics, views.world_from_camera, box[None], near_far, size, scale, CPU)
-    pixels = torch.arange(camera.width * camera.height) if pixels is None else pixels
-    batch = Batch.empty(len(pixels), CPU)
-    buffers = (batch.origins, batch.directions, batch.viewdirs, batch.radii, batch.near, batch.far, batch.hit)
-    form_rays(table, torch.zeros(1, dtype=torch.int64), pixels[None], RayBuffers(*buffers))
-    return batch, views
+def by_torch(table, pixels):
+    nothing = torch.zeros(1, dtype=torch.int64)
+    return form_batch(
+        table, nothing, nothing, 1, pixels[None], torch.zeros(1, len(pixels), dtype=torch.int32)
+    )
+
+
+def compiled(table, pixels):
+    nothing = np.zeros(1, dtype=np.int64)
+    colours = torch.zeros(1, len(pixels), dtype=torch.int32)
+    return CompiledTable(table).form_batch(nothing, nothing, 1, pixels.numpy()[None], colours)
+
+
+@pytest.fixture(params=[by_torch, compiled])
+def rays_of(request):
+    """All rays of a camera, or those of some pixels, formed in each way that there is."""
+
+    def form(camera, pose, box=small_heads.BOX, scale=1.0, pixels=None):
+        views = Views.stack([camera], [pose])
+        near_far = np.array([[0.25, 4.0]])
+        size = (camera.width, camera.height)
+        table = RayTable.build(
+            views.intrinsics, views.world_from_camera, box[None], near_far, size, scale, CPU
+        )
+        pixels = torch.arange(camera.width * camera.height) if pixels is None else pixels
+        return request.param(table, pixels), views
+
+    return form
 
 
 @pytest.mark.parametrize("view", range(small_heads.VIEWS))
 @pytest.mark.parametrize("size", [(24, 20), (150, 131)])
-def test_rays_are_those_of_the_geometry_layer(view, size):
+def test_rays_are_those_of_the_geometry_layer(view, size, rays_of):
     cameras, poses = small_heads.rig_cameras(*size)
     batch, views = rays_of(cameras[view], poses[view])
     expected = cast_rays(views[0], pixel_centers(*size).reshape(-1, 2))
@@ -92,7 +110,7 @@ def test_colours_are_the_bytes_of_the_image(folder):
             assert batch.alpha[ray].item() == expected[3] / np.float32(255)
 
 
-def test_scaling_scales_lengths_and_nothing_else():
+def test_scaling_scales_lengths_and_nothing_else(rays_of):
     cameras, poses = small_heads.rig_cameras()
     metres, _ = rays_of(cameras[0], poses[0])
     scaled, _ = rays_of(cameras[0], poses[0], scale=4.0)
@@ -102,7 +120,7 @@ def test_scaling_scales_lengths_and_nothing_else():
         torch.testing.assert_close(4 * getattr(metres, name), getattr(scaled, name), rtol=1e-6, atol=0)
 
 
-def test_the_last_pixel_of_a_huge_image_has_its_own_ray():
+def test_the_last_pixel_of_a_huge_image_has_its_own_ray(rays_of):
     camera = Camera("PINHOLE", 40_000, 30_000, [50_000.0, 50_000.0, 20_000.0, 15_000.0])
     index = torch.tensor([0, 39_999, 40_000, 40_000 * 30_000 - 1])
     batch, _ = rays_of(camera, Rigid.identity(), pixels=index)
@@ -110,7 +128,7 @@ def test_the_last_pixel_of_a_huge_image_has_its_own_ray():
     assert np.abs(batch.directions[:, :2].numpy() - expected).max() < 3e-8
 
 
-def test_depths_inside_the_box_along_its_faces_and_in_their_plane():
+def test_depths_inside_the_box_along_its_faces_and_in_their_plane(rays_of):
     """Rays straight along z from inside, and a camera in the plane of a face of the box."""
     camera = Camera("PINHOLE", 1, 1, [1.0, 1.0, 0.5, 0.5])
     box = np.array([[-1.0, -1, -1], [1, 1, 1]])
@@ -124,7 +142,7 @@ def test_depths_inside_the_box_along_its_faces_and_in_their_plane():
     assert not behind.hit.item()
 
 
-def test_strong_distortion_takes_more_steps_and_stays_exact():
+def test_strong_distortion_takes_more_steps_and_stays_exact(rays_of):
     camera = Camera("RADIAL", 64, 64, [40.0, 32.0, 32.0, -0.12, 0.03])
     batch, views = rays_of(camera, Rigid.identity())
     expected = cast_rays(views[0], pixel_centers(64, 64).reshape(-1, 2))
@@ -133,11 +151,11 @@ def test_strong_distortion_takes_more_steps_and_stays_exact():
     assert np.abs(batch.radii.numpy() / expected.radii - 1).max() < 1e-5
 
 
-def test_a_lens_that_folds_is_refused():
+def test_a_lens_that_folds_is_refused(rays_of):
     with pytest.raises(LensError, match="folds"):
         rays_of(Camera("SIMPLE_RADIAL", 64, 64, [40.0, 32.0, 32.0, -0.6]), Rigid.identity())
 
 
-def test_radii_are_those_of_a_pinhole():
+def test_radii_are_those_of_a_pinhole(rays_of):
     batch, _ = rays_of(Camera("PINHOLE", 4, 4, [10.0, 20.0, 2.0, 2.0]), Rigid.identity())
     assert batch.radii.numpy() == pytest.approx(2 / math.sqrt(12) * (1 / 10 + 1 / 20) / 2, rel=1e-6)

@@ -39,17 +39,17 @@ def test_every_world_size_draws_the_same_global_stream(name, world):
             assert np.array_equal(expected, np.concatenate(found))
 
 
+@pytest.mark.parametrize("steps", [100, pytest.param(10_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", SAMPLERS)
-def test_a_stream_with_restarts_in_other_world_sizes_is_the_stream(name):
-    uninterrupted = [arrays(SAMPLERS[name]().pick(step, 0, 1)) for step in range(100)]
-    worlds, step = [1, 2, 8, 3], 0
-    while step < 100:
-        world, sampler = worlds[(step // 7) % 4], SAMPLERS[name]()  # a restart every seven steps
-        for _ in range(min(7, 100 - step)):
-            parts = [arrays(sampler.pick(step, rank, world)) for rank in range(world)]
-            for expected, *found in zip(uninterrupted[step], *parts, strict=True):
-                assert np.array_equal(expected, np.concatenate(found))
-            step += 1
+def test_a_stream_with_restarts_in_other_world_sizes_is_the_stream(name, steps):
+    uninterrupted = SAMPLERS[name]()
+    worlds, every = [1, 2, 8, 3], 7
+    for step in range(steps):
+        if step % every == 0:  # a restart
+            world, sampler = worlds[(step // every) % 4], SAMPLERS[name]()
+        parts = [arrays(sampler.pick(step, rank, world)) for rank in range(world)]
+        for expected, *found in zip(arrays(uninterrupted.pick(step, 0, 1)), *parts, strict=True):
+            assert np.array_equal(expected, np.concatenate(found))
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
@@ -101,6 +101,15 @@ def test_foreground_share_draws_that_share_from_the_boxes():
     inside = ((x >= 2) & (x < 9) & (y >= 3) & (y < 14)).mean()
     expected = 0.75 + 0.25 * 7 * 11 / 384
     assert abs(inside - expected) < 4 * np.sqrt(expected * (1 - expected) / 50_000)
+
+
+def test_views_without_a_foreground_are_not_drawn_from_boxes():
+    boxes = np.array([[[0, 0, 0, 0], [4, 4, 8, 10], [0, 0, 0, 0]]])
+    three = ViewIndex(np.ones((1, 3), bool), 16, 24, "raster", boxes)
+    pick = SingleRays(three, seed=0, rays=3000, foreground_share=1.0).pick(0, 0, 1)
+    y, x = np.divmod(pick.pixel[:, 0], 16)
+    assert (pick.view == 1).all()
+    assert (x.min(), x.max(), y.min(), y.max()) == (4, 7, 4, 9)
 
 
 def test_foreground_draws_are_uniform_over_boxes_of_any_size():

@@ -1,8 +1,18 @@
 """Random numbers: SplitMix64 as others have it, uniform, and any part without the rest."""
 
 import numpy as np
+import pytest
 
-from preface.shards.streams import below, bits, mix64, permutation, stream_key, without_replacement
+from preface.shards import compiled
+from preface.shards.streams import (
+    below,
+    below_by_numpy,
+    bits,
+    mix64,
+    permutation,
+    stream_key,
+    without_replacement,
+)
 
 
 def test_the_stream_is_splitmix64():
@@ -25,6 +35,18 @@ def test_numbers_are_uniform_and_below_their_limit():
     assert chi_square < 22.5  # 0.1% of chi-square with six degrees of freedom
     limits = np.array([1, 2, 2**40])
     assert (below(5, 0, 3, limits) < limits).all()
+
+
+@pytest.mark.parametrize("limit", [1, 2, 3, 98_304, 3 * 2**24, 2**40 + 1, 2**53 - 1, 2**53])
+def test_compiled_and_numpys_numbers_are_those_of_whole_arithmetic(limit):
+    key, begin = stream_key(8, limit), 2**40
+    # floor(number / 2^53 * limit), where the product is rounded to a float64; in whole numbers of Python.
+    numbers = [mix64((key + (begin + 1 + i) * 0x9E3779B97F4A7C15) % 2**64) >> 11 for i in range(3000)]
+    expected = [min(int(float(n * limit) / 2**53), limit - 1) for n in numbers]
+    assert compiled.below(key, begin, 3000, limit).tolist() == expected
+    assert below_by_numpy(key, begin, 3000, limit).tolist() == expected
+    assert below(key, begin, 3000, limit).tolist() == expected
+    assert below(key, begin, 3, limit).tolist() == expected[:3]
 
 
 def test_keys_depend_on_every_word_and_its_place():

@@ -1,0 +1,34 @@
+"""Which way batches are formed on a processor: compiled, where numba is installed, or by torch.
+
+Both give the same batches. numba is optional (`pip install preface[fast]`), and importing it takes a moment,
+hence it is looked for when it is first of use.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from importlib import import_module
+from types import ModuleType
+from typing import NamedTuple
+
+
+class Route(NamedTuple):
+    """A way to form batches.
+
+    Attributes:
+        kernels: `preface.shards.compiled`, None without numba.
+        name: "compiled by numba <version>", or "torch" and why not the other.
+    """
+
+    kernels: ModuleType | None
+    name: str
+
+
+@lru_cache(maxsize=1)
+def fastest_route() -> Route:
+    """The route of this installation, found out once."""
+    try:
+        numba = import_module("numba")
+        return Route(import_module("preface.shards.compiled"), f"compiled by numba {numba.__version__}")
+    except ImportError as error:  # also of a numba that does not go with this numpy
+        return Route(None, f"torch ({error})")
