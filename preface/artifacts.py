@@ -36,6 +36,7 @@ VERSIONED_PACKAGES = (
     "mediapipe",
     "pycolmap",
     "google-crc32c",
+    "safetensors",
 )
 LINE_LENGTH = 100  # written values that fit on one such line stay on one line
 
@@ -220,9 +221,9 @@ def write_artifact(path: str | os.PathLike[str], payload: Mapping[str, Any]) -> 
         ArtifactError: the payload is not a valid artefact, or the disk refuses; the file at ``path``
             is then what it was before.
     """
-    content = _plain(payload, path, "")
+    content = json_types(payload, path, "")
     validate(content, path, str(content.get("schema")))
-    return write_bytes(path, f"{_layout(content)}\n".encode())
+    return write_bytes(path, f"{json_text(content)}\n".encode())
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> Path:
@@ -250,13 +251,18 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> Path:
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
-        _sync_directory(path.parent)
+        sync_directory(path.parent)
     except OSError as error:
         raise ArtifactError.from_os(path, "writing", error) from error
     return path
 
 
-def _sync_directory(directory: Path) -> None:
+def sync_directory(directory: Path) -> None:
+    """Force the names in a folder to the disk, as after a rename.
+
+    Raises:
+        OSError: the disk refuses.
+    """
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -267,17 +273,26 @@ def _sync_directory(directory: Path) -> None:
         os.close(descriptor)
 
 
-def _plain(value: Any, path: str | os.PathLike[str], field: str) -> Any:
-    """Reduce ``value`` to JSON types, refusing what JSON cannot hold."""
+def json_types(value: Any, path: str | os.PathLike[str], field: str) -> Any:
+    """Reduce a value to JSON types, numpy arrays and tuples to lists.
+
+    Args:
+        value: what is to be written.
+        path: the file to name in errors.
+        field: the place of ``value`` in it, empty for the whole.
+
+    Raises:
+        ArtifactError: something that JSON cannot hold, such as a number that is not finite.
+    """
     if hasattr(value, "tolist"):  # numpy arrays and scalars, without importing numpy
         value = value.tolist()
     if isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str):
                 raise ArtifactError(path, field or "file", f"has the key {key!r}", "Keys are texts")
-        return {key: _plain(item, path, join_field(field, key)) for key, item in value.items()}
+        return {key: json_types(item, path, join_field(field, key)) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item, path, f"{field}[{index}]") for index, item in enumerate(value)]
+        return [json_types(item, path, f"{field}[{index}]") for index, item in enumerate(value)]
     if isinstance(value, float) and not math.isfinite(value):
         raise ArtifactError(
             path, field, f"is {value}, and artefacts hold finite numbers only", "Leave it out"
@@ -293,7 +308,7 @@ def _plain(value: Any, path: str | os.PathLike[str], field: str) -> Any:
     return value
 
 
-def _layout(value: Any, indent: str = "") -> str:
+def json_text(value: Any, indent: str = "") -> str:
     """JSON that people can read: short values and lists of numbers on one line, the rest indented."""
     line = json.dumps(value, ensure_ascii=False, allow_nan=False)
     is_list = isinstance(value, list)
@@ -303,7 +318,7 @@ def _layout(value: Any, indent: str = "") -> str:
         return line
     inner = indent + "  "
     keys = [""] * len(nested) if is_list else [f"{json.dumps(k, ensure_ascii=False)}: " for k in value]
-    rows = ",\n".join(f"{inner}{key}{_layout(item, inner)}" for key, item in zip(keys, nested, strict=True))
+    rows = ",\n".join(f"{inner}{key}{json_text(item, inner)}" for key, item in zip(keys, nested, strict=True))
     return f"[\n{rows}\n{indent}]" if is_list else f"{{\n{rows}\n{indent}}}"
 
 

@@ -18,10 +18,11 @@ if TYPE_CHECKING:  # these need numpy; --help must not wait for it
     from preface.capture.manifest import Capture
 
 _DESCRIPTION = (
-    "Validate captures, rigs, alignments and reports, print what they hold, and say what is wrong with them."
+    "Validate captures, rigs, alignments and reports, and datasets of shards, print what they hold, "
+    "and say what is wrong with them."
 )
 _EPILOG = "Exit status: 0 when all is well, 1 when something is wrong, 2 for wrong usage."
-_PATH_HELP = "an artefact, or a folder of a capture, a rig or an alignment"
+_PATH_HELP = "an artefact, or a folder of a capture, a rig, an alignment or shards"
 MAX_LISTED = 20  # problems and missing views beyond this are counted; --json lists them all
 
 
@@ -32,7 +33,10 @@ _NAMES = {
     "rig.json": "preface/rig",
     "alignment.json": "preface/alignment-index",
     "template.json": "preface/template",
+    "manifest.json": "preface/shards",
+    "model.json": "preface/prior",
 }
+_SHARDS = "shard-*.safetensors"
 
 
 @dataclass
@@ -85,12 +89,18 @@ def inspect(path: Path) -> list[Report]:
 def _artifacts(path: Path) -> list[Report]:
     """Empty reports for the artefacts at a path; in a folder, their names say their schemas."""
     if not path.is_dir():
-        return [Report(path)]
+        return [Report(path, "preface/shard" if path.match(_SHARDS) else None)]
     found = [Report(path / name, schema) for name, schema in _NAMES.items() if os.path.lexists(path / name)]
     if (path / "subjects").is_dir() and not os.path.lexists(path / "capture.json"):
         found.insert(0, Report(path, "preface/capture"))  # its manifest is inferred
+    if not found and list(path.glob(_SHARDS)):
+        problem = "holds shards and no manifest.json: building was not finished"
+        raise ArtifactError(path, "folder", problem, "Run preface-build-shards again")
     if not found:
-        problem = "holds neither a capture.json nor a rig.json nor an alignment.json nor a folder subjects"
+        problem = (
+            "holds neither a capture.json nor a rig.json nor an alignment.json nor a manifest.json of shards "
+        )
+        problem += "nor a folder subjects"
         raise ArtifactError(path, "folder", problem, "Name an artefact or the folder that holds it")
     return found
 
@@ -105,6 +115,9 @@ def _inspect_artifact(report: Report) -> Report:
         "preface/alignment": _summarise_alignment,
         "preface/landmarks": _summarise_alignment,
         "preface/report": _summarise_report,
+        "preface/prior": _summarise_prior,
+        "preface/shards": _summarise_shards,
+        "preface/shard": _summarise_shards,
     }
     try:
         if report.schema is None:
@@ -259,6 +272,26 @@ def _summarise_report(report: Report) -> None:
         "title": content["title"],
         "sections": [section["heading"] for section in content["sections"]],
     }
+
+
+# ------------------------------------------------------------------------------------------ shards
+
+
+def _summarise_prior(report: Report) -> None:
+    from preface.cli import inspect_prior
+
+    report.summary = inspect_prior.summarise_prior(report.path, report.problems)
+
+
+def _summarise_shards(report: Report) -> None:
+    from preface.cli import inspect_shards
+
+    summarise = (
+        inspect_shards.summarise_shard
+        if report.schema == "preface/shard"
+        else inspect_shards.summarise_dataset
+    )
+    report.summary = summarise(report.path, report.problems)
 
 
 # ------------------------------------------------------------------------------------------ output

@@ -20,7 +20,7 @@ from types import TracebackType
 
 import numpy as np
 
-from preface.artifacts import ArtifactError, _sync_directory
+from preface.artifacts import ArtifactError, sync_directory
 
 _CHANGED = "Build the shards again, or restore the file from a copy"
 
@@ -144,7 +144,7 @@ class AtomicFile:
             if kind is None:
                 os.replace(self._temporary, self.path)  # noqa: PTH105 - one name for faults to be injected at
                 named = True
-                _sync_directory(self.path.parent)
+                sync_directory(self.path.parent)
         except OSError as failure:
             raise ArtifactError.from_os(self.path, "writing", failure) from failure
         finally:

@@ -15,7 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from preface.artifacts import ArtifactError, _layout, _plain, load_json, resolve_inside, validate, write_bytes
+from preface.artifacts import (
+    ArtifactError,
+    json_text,
+    json_types,
+    load_json,
+    resolve_inside,
+    validate,
+    write_bytes,
+)
 from preface.shards.checksums import NO_DIGEST, text_digest
 from preface.shards.format import PIXEL_ORDERS, PixelOrder, shard_name
 
@@ -97,9 +105,9 @@ def write_manifest(folder: str | os.PathLike[str], payload: Mapping[str, Any]) -
         ArtifactError: the content is no manifest, or the disk refuses.
     """
     path = Path(folder) / MANIFEST_FILE
-    content = _plain({**payload, "digest": NO_DIGEST}, path, "")
+    content = json_types({**payload, "digest": NO_DIGEST}, path, "")
     validate(content, path, SCHEMA)
-    blank = f"{_layout(content)}\n".encode()
+    blank = f"{json_text(content)}\n".encode()
     declared, digest = text_digest(blank)
     if declared != NO_DIGEST:
         raise ArtifactError(path, "configuration", "contains what reads as a digest", "Rename that key")

@@ -16,8 +16,9 @@ from preface.capture.foreground.matting import OnnxMatting
 from preface.capture.foreground.result import Hints, Segmenter
 from preface.capture.foreground.screen import GreenScreen
 from preface.capture.foreground.selfie import Selfie
-from preface.capture.images import read_image
+from preface.capture.images import ImageError, read_image
 from preface.capture.manifest import Capture, Take
+from preface.capture.upright import read_upright
 
 METHODS = ("given", "green", "black", "plate", "selfie", "onnx", "none")
 MAX_LOOKED_AT = 6  # photographs of a take whose borders are measured where nothing else decides
@@ -149,7 +150,12 @@ def _automatic(
 def _measured(capture: Capture, views: list[tuple[str, str]]) -> tuple[str, str]:
     """What the borders of some photographs show: "black", "green" or "natural", and the measurement in words."""
     picked = sorted({int(i) for i in np.linspace(0, len(views) - 1, min(len(views), MAX_LOOKED_AT))})
-    kinds = [border_kind(read_image(capture.images[views[index]])) for index in picked]
+    kinds = []
+    for index in picked:
+        try:
+            kinds.append(border_kind(read_upright(capture.images[views[index]])))
+        except ImageError:
+            continue  # whoever uses this photograph says what is wrong with it; the others are enough here
     for kind in ("black", "green"):
         if kinds and kinds.count(kind) > 0.5 * len(kinds):
             return kind, f"the border of {kinds.count(kind)} of {len(kinds)} photographs looked at is {kind}"

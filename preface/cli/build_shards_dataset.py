@@ -1,0 +1,241 @@
+"""``preface-build-shards CAPTURE``: plan, build every shard, write the dataset's papers and its manifest."""
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+from tqdm import tqdm
+
+from preface.align.alignment_files import read_index
+from preface.artifacts import ArtifactError
+from preface.cli.align_inputs import rigs_of_takes
+from preface.cli.output import say
+from preface.cli.usage import UsageError
+from preface.shards.dataset.configuration import HEAD_BOX, BuildConfiguration
+from preface.shards.dataset.finishing import Built, build_all, finish
+from preface.shards.dataset.people import LeftOut, People, find_people, is_capture
+from preface.shards.dataset.plan import (
+    ShardTask,
+    check_framing,
+    default_jobs,
+    estimate,
+    foreground_choices,
+    people_per_shard,
+    shard_tasks,
+    splits,
+)
+from preface.shards.dataset.schedulers import run_dask, run_local
+from preface.shards.dataset.tasks import TaskResult, run_task, strict_error, use_one_thread
+from preface.shards.format import shard_name
+from preface.shards.manifest import MANIFEST_FILE
+
+MAX_NAMED = 20  # remarks on standard error; the data card has more and the manifest all
+Runner = Callable[[Sequence[ShardTask]], Iterator[TaskResult]]
+
+
+def run(config: argparse.Namespace) -> list[str]:
+    """Build, or say what building would take; returns the lines to print."""
+    _check_usage(config)
+    people, tasks = _plan(config)
+    if config.dry_run:
+        return _dry_run(config, people, tasks)
+    if config.shard is not None:
+        return _one(config, tasks)
+    if config.finish:
+        _require_all(tasks)
+    make_folder(config.output)
+    use_one_thread()
+    named = _Named()
+    with tqdm(
+        total=sum(len(task.people) for task in tasks), desc="heads", unit="head", disable=None, smoothing=0.1
+    ) as bar:
+
+        def done(task: ShardTask, result: TaskResult) -> None:
+            if result.state != "claimed":
+                bar.update(len(task.people) if result.state != "empty" else 0)
+            for entry in result.left_out:
+                named(str(entry))
+
+        built = build_all(tasks, _runner(config), done)
+    named.end()
+    manifest = finish(built, people, config.source, config.holdout, config.seed, config.name)
+    return [*_summary(built, people), str(manifest)]
+
+
+def _check_usage(config: argparse.Namespace) -> None:
+    chosen = [flag for flag in ("dry_run", "finish") if getattr(config, flag)]
+    chosen += ["shard"] if config.shard is not None else []
+    if len(chosen) > 1:
+        flags = " and ".join("--" + flag.replace("_", "-") for flag in chosen)
+        raise UsageError(f"{flags} exclude each other")
+    if config.dask_address and config.scheduler != "dask":
+        raise UsageError("--dask-address is for --scheduler dask")
+    if config.foreground == "onnx" and config.matting_model is None:
+        raise UsageError("--foreground onnx needs --matting-model")
+    if config.matting_model is not None and config.foreground not in ("auto", "onnx"):
+        raise UsageError(f"--matting-model is not used by --foreground {config.foreground}")
+    if config.masks is not None and is_capture(config.source):
+        raise UsageError(
+            "--masks is for a folder of photographs; those of a capture lie in its own folder masks"
+        )
+    if config.box and not all(low < high for low, high in zip(config.box[:3], config.box[3:], strict=True)):
+        raise UsageError("--box: each of X1 Y1 Z1 must be greater than its X0 Y0 Z0")
+
+
+# ---------------------------------------------------------------------------------------- the plan
+
+
+def _plan(config: argparse.Namespace) -> tuple[People, list[ShardTask]]:
+    """Everybody, and one task per shard; says who is left out and how the foreground is found.
+
+    Raises:
+        ArtifactError: nobody is left, or, with --strict, somebody is left out.
+    """
+    if config.scheduler == "dask":  # its workers may have another working directory
+        for path in ("source", "output", "matting_model", "masks"):
+            setattr(config, path, getattr(config, path) and getattr(config, path).resolve())
+    index = read_index(config.alignment)
+    takes = list(dict.fromkeys(entry.take for entry in index.aligned))
+    found, notes = rigs_of_takes(config.rig, takes)
+    for note in notes:
+        say(f"note: {note}")
+    rigs = {take: (entry.path, entry.rig) for take, entry in found.items()}
+    people = find_people(config.source, config.alignment, rigs, config.only, config.max_pixels, config.masks)
+    named = _Named()
+    for entry in people.left_out:
+        named(str(entry))
+    named.end()
+    if not people.people:
+        problem = f"not one of the people can be used: {'; '.join(map(str, people.left_out[:3]))}"
+        raise ArtifactError(config.source, "subjects", problem, "Correct the capture or the alignment")
+    configuration = _configuration(config, len(people.cameras))
+    check_framing(people, configuration)
+    choices = foreground_choices(people, configuration)
+    for take, choice in choices.items():
+        say(f"take {take}: foreground by '{choice.method}', because {choice.reason}")
+    tasks = shard_tasks(people, choices, configuration, config.output, config.strict)
+    if config.strict and people.left_out:
+        raise strict_error(config.source, people.left_out[0])
+    splits([p.identity for p in people.people], config.holdout, config.seed, config.source)  # or say so now
+    return people, tasks
+
+
+def _configuration(config: argparse.Namespace, views: int) -> BuildConfiguration:
+    width, height = config.resolution
+    return BuildConfiguration(
+        width=width,
+        height=height,
+        framing=config.framing,
+        box=tuple(config.box or HEAD_BOX),
+        filter=config.filter,
+        light=config.light,
+        undistort=config.undistort,
+        white=config.white,
+        foreground=config.foreground,
+        matting_model=config.matting_model,
+        pixel_order=config.pixel_order,
+        identities_per_shard=config.identities_per_shard or people_per_shard(views, width, height),
+        max_pixels=config.max_pixels,
+    )
+
+
+def _dry_run(config: argparse.Namespace, people: People, tasks: list[ShardTask]) -> list[str]:
+    found = estimate(tasks, config.jobs or default_jobs())
+    enough = "" if found.dataset_bytes < found.free_bytes else ", which is NOT enough"
+    return [
+        f"{found.people} identities, {found.views} views, {len(people.left_out)} people or views left out",
+        f"{found.shards} shards (0 to {found.shards - 1}) of {found.dataset_bytes / 1e9:.3g} GB in all; "
+        f"{found.free_bytes / 1e9:.3g} GB are free at {config.output}{enough}",
+        f"about {_duration(found.seconds)} in {config.jobs or default_jobs()} processes, by the time of one view",
+        "nothing was written",
+    ]
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+# ---------------------------------------------------------------------------------------- building
+
+
+def _runner(config: argparse.Namespace) -> Runner:
+    jobs = config.jobs or default_jobs()
+    if config.scheduler == "dask":
+        return partial(run_dask, address=config.dask_address, jobs=jobs)
+    return partial(run_local, jobs=jobs)
+
+
+def _one(config: argparse.Namespace, tasks: list[ShardTask]) -> list[str]:
+    """Build one shard of many."""
+    if config.shard >= len(tasks):
+        problem = f"there is no shard {config.shard}, only 0 to {len(tasks) - 1}"
+        raise ArtifactError(config.output, "shard", problem, "Correct --shard")
+    make_folder(config.output)
+    use_one_thread()
+    result = run_task(tasks[config.shard])
+    for entry in result.left_out:
+        say(str(entry))
+    words = {
+        "built": "built",
+        "kept": "finished before, verified and kept",
+        "claimed": "being built by another process",
+        "empty": "not written: not one of its people can be used",
+    }
+    path = config.output / shard_name(config.shard)
+    return [f"shard {config.shard} of {len(tasks)}: {words[result.state]}", str(path)]
+
+
+def _require_all(tasks: list[ShardTask]) -> None:
+    missing = [t.number for t in tasks if not (t.folder / shard_name(t.number)).is_file()]
+    if missing:
+        some = ", ".join(map(str, missing[:10])) + (", ..." if len(missing) > 10 else "")
+        problem = f"{len(missing)} of {len(tasks)} shards are missing: {some}"
+        remedy = "Build them with --shard, or run without --finish to build what is missing here"
+        raise ArtifactError(tasks[0].folder, "shards", problem, remedy)
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder of a dataset.
+
+    Raises:
+        ArtifactError: it cannot be made, or it holds other things than a dataset.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        names = {path.name for path in folder.iterdir()}
+    except OSError as error:
+        raise ArtifactError.from_os(folder, "writing", error) from error
+    ours = [name for name in names if name == MANIFEST_FILE or name.lstrip(".").startswith("shard-")]
+    if names and not ours:
+        problem = f"holds other things than a dataset ({', '.join(sorted(names)[:3])})"
+        raise ArtifactError(folder, "folder", problem, "Choose a new folder, or empty this one")
+
+
+def _summary(built: Built, people: People) -> list[str]:
+    identities = sum(len(result.identities) for result in built.results)
+    kept = sum(result.state == "kept" for result in built.results)
+    left_out: list[LeftOut] = [*people.left_out, *built.left_out]
+    return [
+        f"{identities} identities in {len(built.results)} shards, {kept} of them finished before and kept",
+        f"{len(left_out)} people or views left out" + ("; the data card says why" if left_out else ""),
+    ]
+
+
+class _Named:
+    """Says the first remarks, and how many there were at the end."""
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def __call__(self, words: str) -> None:
+        self._count += 1
+        if self._count <= MAX_NAMED:
+            tqdm.write(words, file=sys.stderr)
+
+    def end(self) -> None:
+        if self._count > MAX_NAMED:
+            say(f"... and {self._count - MAX_NAMED} more; the data card says why")

@@ -1,0 +1,38 @@
+"""What `preface-inspect` says of a prior, or of a head that was fitted from one."""
+
+from pathlib import Path
+from typing import Any
+
+from preface.artifacts import ArtifactError
+
+
+def summarise_prior(path: Path, problems: list[ArtifactError]) -> dict[str, Any]:
+    """Read ``model.json`` and check the tensors that it describes; what is wrong with those joins ``problems``."""
+    from preface.model.training.checkpoint import STATE, read_tensors
+    from preface.model.training.prior_files import read_prior
+
+    prior = read_prior(path)
+    parameters = None
+    try:
+        parameters = sum(p.numel() for p in prior.load_model().parameters())
+        if STATE in prior.files:
+            read_tensors(prior.path, {"files": prior.files}, STATE)
+    except ArtifactError as error:
+        problems.append(error)
+    model, scene = prior.model, prior.scene
+    return {
+        "steps": f"{prior.step} of {prior.steps}{'' if prior.finished else ', not finished'}",
+        "identities": list(prior.identities),
+        "parameters": parameters,
+        "latent": model.latent,
+        "networks": f"proposal {model.proposal.depth}x{model.proposal.width}, "
+        f"NeRF {model.nerf.depth}x{model.nerf.width}",
+        "samples": list(model.samples),
+        "encoding_levels": model.levels,
+        "background": model.background,
+        "resolution": f"{scene.resolution[0]}x{scene.resolution[1]}",
+        "box_m": scene.box.reshape(-1).tolist(),
+        "held_out_views": sum(len(views) for views in prior.held_out.values()),
+        "validation": [f"{name} {value:.6g}" for name, value in prior.validation.items()],
+        "can_resume": STATE in prior.files,
+    }
