@@ -135,18 +135,39 @@ def project_frustums(
     Returns:
         mean [..., n, b] and variance [..., n, b].
     """
-    basis = basis.to(origins)
+    anchor, offset, t_var, r_var = frustums_about_anchor(tdist, radii)
+    middle, along, across = (x[..., None, :] for x in project_axes(origins, directions, anchor, basis))
+    mean = middle + offset[..., None] * along
+    return mean, t_var[..., None] * (along * along) + r_var[..., None] * across
+
+
+@full_precision
+def frustums_about_anchor(tdist: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The part of `project_frustums` that belongs to intervals [..., n] and not to directions.
+
+    Returns:
+        anchor [..., 1], the middle of the ray; means less the anchor, variances along and across [..., n].
+    """
     t0, t1 = tdist[..., :-1], tdist[..., 1:]
     lag, t_var, r_var = _frustum_shape(t0, t1, radii)
     anchor = (tdist[..., :1] + tdist[..., -1:]) / 2
-    from_anchor = ((t0 - anchor) + (t1 - anchor)) / 2 + lag
+    return anchor, ((t0 - anchor) + (t1 - anchor)) / 2 + lag, t_var, r_var
+
+
+@full_precision
+def project_axes(
+    origins: Tensor, directions: Tensor, anchor: Tensor, basis: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The part of `project_frustums` that belongs to rays [...] and not to their intervals.
+
+    Returns:
+        b.(o + anchor d), b.d and |b x d|^2/|d|^2 for every direction b of the basis, [..., b].
+    """
+    basis = basis.to(origins)
     middle = _project(origins.double() + anchor.double() * directions.double(), basis.double()).to(basis)
-    along = _project(directions, basis)[..., None, :]
     axis = normalize(directions, _SHORTEST_DIRECTION)
     across = torch.linalg.cross(axis[..., None, :], basis.T.expand(*axis.shape[:-1], -1, -1))
-    across = (across * across).sum(dim=-1)[..., None, :]
-    mean = middle[..., None, :] + from_anchor[..., None] * along
-    return mean, t_var[..., None] * (along * along) + r_var[..., None] * across
+    return middle, _project(directions, basis), (across * across).sum(dim=-1)
 
 
 def _project(vectors: Tensor, basis: Tensor) -> Tensor:

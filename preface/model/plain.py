@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from preface.model import coord, losses, stepfun, volume
+from preface.model import coord, losses, sampling, stepfun, volume
 
 LEVELS = 12  # of the position's encoding
 VIEW_LEVELS = 4
@@ -122,7 +122,7 @@ class PlainModel(nn.Module):
         levels: list[Level] = []
         for index in range(len(self.samples)):
             sdist = self._resample(sdist, weights, index, stepfun.anneal_exponent(train_frac)).detach()
-            tdist = sdist * rays.far + (1 - sdist) * rays.near
+            tdist = sampling.ray_parameters(sdist, rays.near, rays.far)
             mean, var = coord.project_frustums(rays.origins, rays.directions, tdist, rays.radii, self.basis)
             last = index == len(self.samples) - 1
             if last:
