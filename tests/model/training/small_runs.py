@@ -1,0 +1,38 @@
+"""Runs that take a second or two."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from preface.model.configuration import ModelConfig, NetworkConfig
+from preface.model.training.configuration import RunConfig, TrainConfig, TrainingConfig
+
+MODEL = ModelConfig(
+    latent=8,
+    proposal=NetworkConfig(1, 16),
+    nerf=NetworkConfig(2, 32),
+    bottleneck=8,
+    view_width=8,
+    view_levels=1,
+    levels=5,
+    samples=(12, 8),
+)
+TRAINING = TrainingConfig(steps=20, identities=3, views=2, rays=16, rate=1e-2, rate_last=1e-3, clip=0.0)
+RUN = RunConfig(
+    device="cpu", products="mkl", micro_rays=64, log_every=5, validate_every=10**6, validate_views=1
+)
+
+
+def config(shards: Path, output: Path, training=None, run=None, **model) -> TrainConfig:
+    """A run with some fields changed."""
+    return TrainConfig(
+        shards=shards,
+        output=output,
+        preset="tiny",
+        training=replace(TRAINING, **(training or {})),
+        run=replace(RUN, **(run or {})),
+        model=replace(MODEL, **model),
+    )
+
+
+def quiet(words: str) -> None:
+    """Says nothing."""
