@@ -1,0 +1,127 @@
+"""``preface-render``: images, depth and normals of a prior's identities, or of a head, from any camera.
+
+This module reads the command line; `render_frames` does the work and is imported when it is needed, so that
+``--help`` does not wait for PyTorch.
+"""
+
+import argparse
+import math
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from preface.artifacts import ArtifactError
+from preface.cli.output import print_lines, whole_number
+from preface.cli.usage import UsageError
+
+_DESCRIPTION = "Render what a model knows of a head: colour, opacity, depth and normals."
+_EPILOG = "Exit status: 0 when everything was written, 1 when something is wrong, 2 for wrong usage."
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit status."""
+    parser = _parser()
+    config = parser.parse_args(arguments)
+    from preface.cli.render_frames import run
+    from preface.geometry import GeometryError
+
+    try:
+        lines = run(config)
+    except UsageError as error:
+        parser.error(str(error))
+    except ArtifactError as error:
+        print(error, file=sys.stderr)
+        return 1
+    except GeometryError as error:
+        print(f"preface-render: {error}", file=sys.stderr)
+        return 1
+    return print_lines(lines)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("preface-render", description=_DESCRIPTION, epilog=_EPILOG)
+    parser.add_argument("model", type=Path, help="folder of a prior or a head, or its model.json")
+    parser.add_argument("--output", type=Path, required=True, help="folder for the images, made if absent")
+    who = parser.add_argument_group("who")
+    who.add_argument("--identity", help="whose code to render; may be left out if there is only one")
+    who.add_argument(
+        "--towards", help="another identity: codes go from the first to this one, frame by frame"
+    )
+    where = parser.add_argument_group("from where").add_mutually_exclusive_group()
+    where.add_argument(
+        "--orbit",
+        type=whole_number(1),
+        metavar="FRAMES",
+        help="cameras around the head (default: one, in front)",
+    )
+    where.add_argument(
+        "--cameras",
+        type=Path,
+        help="a rig.json or any format that preface-calibrate imports, whose cameras to use",
+    )
+    parser.add_argument(
+        "--alignment",
+        type=Path,
+        help="<identity>.json that carries the rig of --cameras to the canonical frame (default: it is that frame)",
+    )
+    path = parser.add_argument_group("the orbit")
+    path.add_argument(
+        "--azimuth", type=_number(0, 180), default=40.0, help="degrees to either side, 180: all around"
+    )
+    path.add_argument("--elevation", type=_number(-85, 85), default=10.0, help="degrees up and down")
+    path.add_argument(
+        "--distance", type=_number(1e-3, 1e3), default=1.0, help="metres from the middle of the box"
+    )
+    image = parser.add_argument_group("the images")
+    image.add_argument(
+        "--size", type=_size, metavar="WxH", help="of an orbit's images (default: those of training)"
+    )
+    image.add_argument(
+        "--background", type=_number(0, 1), default=0.0, help="grey value behind the head, 0 to 1"
+    )
+    image.add_argument("--no-normals", action="store_true", help="save the time that normals take")
+    image.add_argument("--no-exr", action="store_true", help="PNG only")
+    image.add_argument("--video", action="store_true", help="also orbit.webm")
+    mesh = parser.add_argument_group("the surface")
+    mesh.add_argument("--mesh", type=Path, metavar="FILE", help="also write a mesh: .ply, .glb or .obj")
+    mesh.add_argument(
+        "--mesh-resolution",
+        type=whole_number(2),
+        default=256,
+        metavar="N",
+        help="voxels along the box's longest side",
+    )
+    speed = parser.add_argument_group("speed")
+    speed.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
+    speed.add_argument(
+        "--rays-at-a-time", type=whole_number(1), default=4096, metavar="N", help="memory goes with it"
+    )
+    return parser
+
+
+def _number(low: float, high: float) -> Callable[[str], float]:
+    """The type of a flag that takes a number within limits."""
+
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"'{text}' is not a number from {low:g} to {high:g}")
+        return value
+
+    return number
+
+
+def _size(text: str) -> tuple[int, int]:
+    """The type of a flag that takes WxH."""
+    match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a width and a height, such as 512x768")
+    return int(match[1]), int(match[2])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

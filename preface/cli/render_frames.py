@@ -1,0 +1,234 @@
+"""The work of ``preface-render``: which cameras, which code, and the files of each frame."""
+
+import argparse
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from preface.align.person_file import read_alignment
+from preface.artifacts import ArtifactError, provenance
+from preface.capture.formats import read_rig_from
+from preface.capture.images import write_exr, write_png
+from preface.capture.rig import Rig, RigCamera, read_rig, write_rig
+from preface.cli.output import say
+from preface.cli.usage import UsageError
+from preface.geometry import Box, Camera, Rigid
+from preface.model.matmul import flush_denormals, keep_freed_memory
+from preface.model.model import PriorModel, Render
+from preface.model.rays import Rays
+from preface.model.rendering.image import RenderedImage, Space, render_image
+from preface.model.rendering.mesh import MESH_SUFFIXES, extract_mesh, model_field, voxel_side, write_mesh
+from preface.model.rendering.paths import framing_camera, on_sphere, orbit
+from preface.model.training.prior_files import Prior, read_prior
+from preface.plain_words import suggestion
+from preface.reports.pictures import Picture, as_picture, colorize
+
+CAMERAS_FILE, VIDEO_FILE = "rig.json", "orbit.webm"
+FRAMES_PER_SECOND = 24
+
+
+def run(config: argparse.Namespace) -> list[str]:
+    """Render every frame and write its files, then the cameras."""
+    if config.mesh is not None and config.mesh.suffix not in MESH_SUFFIXES:
+        raise UsageError(f"--mesh: {config.mesh.name} does not end in one of {', '.join(MESH_SUFFIXES)}")
+    keep_freed_memory()
+    flush_denormals()
+    prior = read_prior(config.model)
+    device = _device(config.device)
+    box = Box(prior.scene.box[0], prior.scene.box[1])
+    frames = _cameras(config, prior, box)
+    codes = _codes(config, prior, len(frames))
+    model = prior.load_model().to(device)
+    space = Space(box, prior.scene.scene_scale)
+    try:
+        config.output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ArtifactError.from_os(config.output, "writing", error) from error
+    meshed = _mesh(config, model, space, codes[0]) if config.mesh is not None else []
+    began, video = time.perf_counter(), _Video(config.output / VIDEO_FILE) if config.video else None
+    for number, ((name, (camera, pose)), weights) in enumerate(zip(frames.items(), codes, strict=True)):
+        code = _code(model, weights)
+        render = _renderer(
+            model, None if code is None else code[None], config.background, not config.no_normals
+        )
+        image = render_image(render, space, camera, pose, rays_at_a_time=config.rays_at_a_time, device=device)
+        picture = _write(config.output, name, image, box, pose, exr=not config.no_exr)
+        if video is not None:
+            video.add(picture)
+        passed = time.perf_counter() - began
+        left = passed / (number + 1) * (len(frames) - number - 1)
+        say(f"{number + 1} of {len(frames)} images, {passed:.0f} s, about {left:.0f} s left")
+    settings = {key: str(value) for key, value in vars(config).items() if value is not None}
+    cameras = {name: RigCamera.at(camera, pose.inverse) for name, (camera, pose) in frames.items()}
+    history = provenance(settings, {"model.json": prior.path})
+    written = write_rig(config.output / CAMERAS_FILE, Rig("canonical", cameras, provenance=history))
+    lines = [str(video.finish())] if video is not None else []
+    return [*meshed, *lines, str(written)]
+
+
+def _device(name: str) -> torch.device:
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise UsageError(f"--device: {name} cannot be used here ({str(error).splitlines()[0]})") from error
+    return device
+
+
+def _renderer(
+    model: PriorModel, code: Tensor | None, background: float, normals: bool
+) -> Callable[[Rays], Render]:
+    def render(rays: Rays) -> Render:
+        with torch.no_grad():
+            return model(rays, code, background=background, normals=normals)
+
+    return render
+
+
+def _code(model: PriorModel, weights: np.ndarray) -> Tensor | None:
+    """The mixture of codes [latent]; None for a model without codes."""
+    mixed = torch.from_numpy(weights).to(model.codes.device) @ model.codes.detach()
+    return mixed if model.config.latent else None
+
+
+def _mesh(config: argparse.Namespace, model: PriorModel, space: Space, weights: np.ndarray) -> list[str]:
+    """Write the surface of the first frame's code."""
+    field = model_field(model, _code(model, weights), voxel_side(space, config.mesh_resolution))
+    try:
+        mesh = extract_mesh(field, space, config.mesh_resolution, model.codes.device)
+    except ValueError as error:
+        field_name, _, problem = str(error).partition(": ")
+        raise ArtifactError(config.model, field_name, problem, "Train or fit the model further") from error
+    say(f"mesh: {len(mesh.triangles)} triangles")
+    return [str(write_mesh(config.mesh, mesh))]
+
+
+# ------------------------------------------------------------------------------------- from where
+
+
+def _cameras(config: argparse.Namespace, prior: Prior, box: Box) -> dict[str, tuple[Camera, Rigid]]:
+    """Cameras with their poses canonical_from_camera, by the name of their images."""
+    if config.cameras is not None:
+        return _given_cameras(config)
+    if config.alignment is not None:
+        raise UsageError("--alignment speaks of the cameras that --cameras gives, and there are none")
+    width, height = config.size or prior.scene.resolution
+    camera = framing_camera(box.half_sides, config.distance, width, height)
+    azimuth, elevation = math.radians(config.azimuth), math.radians(config.elevation)
+    if config.orbit is None:
+        return {"front": (camera, on_sphere(box.center, 0.0, 0.0, config.distance))}
+    poses = orbit(box.center, config.orbit, config.distance, azimuth, elevation)
+    return {f"{number:04d}": (camera, pose) for number, pose in enumerate(poses)}
+
+
+def _given_cameras(config: argparse.Namespace) -> dict[str, tuple[Camera, Rigid]]:
+    if config.size is not None:
+        raise UsageError("--size is that of an orbit; the cameras of --cameras have sizes of their own")
+    try:
+        rig = read_rig(config.cameras)
+    except ArtifactError as error:
+        if config.cameras.suffix == ".json" and config.cameras.name.startswith("rig"):
+            raise
+        try:
+            rig = read_rig_from(config.cameras)
+        except ArtifactError as other:
+            raise other from error
+    poses = {name: camera.camera_from_rig.inverse for name, camera in rig.cameras.items()}
+    if config.alignment is not None:
+        carry = read_alignment(config.alignment).placement.canonical_from_rig.apply_to_pose
+        poses = {name: carry(pose) for name, pose in poses.items()}
+    return {name: (rig.cameras[name].camera, pose) for name, pose in poses.items()}
+
+
+# -------------------------------------------------------------------------------------------- who
+
+
+def _codes(config: argparse.Namespace, prior: Prior, frames: int) -> np.ndarray:
+    """What each identity's code contributes to each frame, float32 [frames, identities]."""
+    names = prior.identities
+    if config.identity is None and len(names) > 1:
+        shown = ", ".join(names[:5]) + (" ..." if len(names) > 5 else "")
+        raise UsageError(f"--identity is needed: the model knows {len(names)} ({shown})")
+    first = _index(prior, config.identity) if config.identity is not None else 0
+    last = _index(prior, config.towards) if config.towards is not None else first
+    weights = np.zeros((frames, len(names)), np.float32)
+    for number, share in enumerate(np.linspace(0, 1, frames) if frames > 1 else [0.0]):
+        weights[number, first] += 1 - share
+        weights[number, last] += share
+    return weights
+
+
+def _index(prior: Prior, name: str) -> int:
+    if name not in prior.identities:
+        hint = suggestion(name, prior.identities)
+        raise ArtifactError(
+            prior.path, "identities", f"there is no '{name}'", hint or "Choose one that is there"
+        )
+    return prior.identities.index(name)
+
+
+# ------------------------------------------------------------------------------------- the files
+
+
+def _write(folder: Path, name: str, image: RenderedImage, box: Box, pose: Rigid, *, exr: bool) -> Picture:
+    """Write a frame's files; returns the colours as shown."""
+    picture = as_picture(image.rgb)
+    write_png(folder / f"{name}.png", picture)
+    write_png(folder / f"{name}.alpha.png", np.rint(image.alpha * 255).astype(np.uint8))
+    near, far = _depth_range(box, pose)
+    write_png(folder / f"{name}.depth.png", colorize(image.depth, near, far, "viridis"))
+    channels: dict[str, Any] = {"Z": image.depth}
+    if image.normals is not None:
+        shown = np.where(np.isnan(image.normals), 0.0, (image.normals + 1) / 2)
+        write_png(folder / f"{name}.normals.png", as_picture(shown.astype(np.float32)))
+        channels |= {f"N.{axis}": np.ascontiguousarray(image.normals[..., i]) for i, axis in enumerate("XYZ")}
+    if exr:
+        colors = {c: np.ascontiguousarray(image.rgb[..., i]) for i, c in enumerate("RGB")}
+        write_exr(folder / f"{name}.exr", {**colors, "A": image.alpha, **channels})
+    return picture
+
+
+def _depth_range(box: Box, pose: Rigid) -> tuple[float, float]:
+    """The depths of the box in front of a camera."""
+    corners = np.stack(np.meshgrid(*zip(box.minimum, box.maximum, strict=True), indexing="ij"), -1)
+    depths = pose.inverse.apply(corners.reshape(-1, 3))[:, 2]
+    return max(float(depths.min()), 0.0), max(float(depths.max()), 1e-6)
+
+
+class _Video:
+    """A WebM file (VP9), written under another name until it is finished."""
+
+    def __init__(self, path: Path):
+        self._path, self._partial = path, path.with_name(f".{path.name}")
+        self._writer: cv2.VideoWriter | None = None
+        self._size = (0, 0)
+
+    def add(self, picture: Picture) -> None:
+        """Append a picture; all have the size of the first."""
+        size = picture.shape[1], picture.shape[0]
+        if self._writer is None:
+            self._size = size
+            codec = cv2.VideoWriter.fourcc(*"VP90")
+            partial = self._partial.with_name(f"{self._partial.name}.partial.webm")
+            self._partial = partial
+            self._writer = cv2.VideoWriter(str(partial), codec, FRAMES_PER_SECOND, size)
+            if not self._writer.isOpened():
+                raise ArtifactError(
+                    self._path, "video", "cannot be written", "Check the folder, or omit --video"
+                )
+        if size != self._size:
+            raise ArtifactError(self._path, "video", "its frames differ in size", "Omit --video")
+        self._writer.write(np.ascontiguousarray(picture[:, :, ::-1]))
+
+    def finish(self) -> Path:
+        """Close the file and give it its name."""
+        assert self._writer is not None
+        self._writer.release()
+        return self._partial.replace(self._path)

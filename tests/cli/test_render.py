@@ -1,0 +1,157 @@
+"""``preface-render`` as a user runs it, on a prior of ball-shaped heads that was hardly trained."""
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import open3d as o3d
+import pytest
+
+from preface.capture.images import read_exr, read_image
+from preface.capture.rig import read_rig
+from preface.cli.render import main
+from preface.cli.train import main as train
+from preface.model.training.prior_files import read_prior
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "model" / "training"))
+
+STEPS = ["--steps", "30", "--identities", "3", "--views", "2", "--rays", "64", "--log-every", "30"]
+
+
+@pytest.fixture(scope="module")
+def prior(tmp_path_factory) -> Path:
+    import ball_heads
+
+    shards = tmp_path_factory.mktemp("balls")
+    ball_heads.write_dataset(shards)
+    folder = tmp_path_factory.mktemp("prior")
+    arguments = ["--preset", "tiny", "--output", str(folder), "--final-views", "1", "--faces-between", "0"]
+    assert train([str(shards), *arguments, *STEPS]) == 0
+    return folder
+
+
+def names(prior: Path) -> list[str]:
+    return list(read_prior(prior).identities)
+
+
+def test_one_image_from_the_front_with_everything_known_of_it(prior, tmp_path, capsys):
+    arguments = [
+        str(prior),
+        "--identity",
+        names(prior)[0],
+        "--size",
+        "20x30",
+        "--output",
+        str(tmp_path / "out"),
+    ]
+    assert main(arguments) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "out" / "rig.json")
+    written = sorted(file.name for file in (tmp_path / "out").iterdir())
+    assert written == [
+        "front.alpha.png",
+        "front.depth.png",
+        "front.exr",
+        "front.normals.png",
+        "front.png",
+        "rig.json",
+    ]
+    channels = read_exr(tmp_path / "out" / "front.exr")
+    assert set(channels) == {"R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z"}
+    picture = read_image(tmp_path / "out" / "front.png")
+    assert picture.shape == (30, 20, 3)
+    np.testing.assert_allclose(picture[..., 0], np.clip(channels["R"], 0, 1) * 255, atol=0.51)
+    seen = channels["A"] > 0.5
+    # Depths lie inside the box, a metre away and at most its diagonal deep; normals have length one.
+    assert (np.abs(channels["Z"][seen] - 1) < 0.6).all()
+    lengths = np.sqrt(sum(channels[f"N.{axis}"][seen] ** 2 for axis in "XYZ"))
+    np.testing.assert_allclose(lengths, 1, atol=1e-5)
+    assert np.isnan(channels["Z"][~seen]).all()
+
+
+def test_cameras_that_were_written_render_the_same_images(prior, tmp_path):
+    first, again = tmp_path / "first", tmp_path / "again"
+    who = ["--identity", names(prior)[1], "--no-normals"]
+    assert main([str(prior), *who, "--orbit", "2", "--size", "12x16", "--output", str(first)]) == 0
+    assert main([str(prior), *who, "--cameras", str(first / "rig.json"), "--output", str(again)]) == 0
+    assert len(read_rig(first).cameras) == 2
+    for name in ("0000.png", "0001.png", "0001.depth.png"):
+        difference = read_image(first / name).astype(int) - read_image(again / name)
+        assert np.abs(difference).max() <= 1
+
+
+def test_codes_go_from_one_identity_to_another_and_a_video_has_every_frame(prior, tmp_path):
+    one, other = names(prior)[:2]
+    out = tmp_path / "out"
+    arguments = ["--orbit", "3", "--size", "16x24", "--no-exr", "--no-normals", "--video", "--azimuth", "0"]
+    assert (
+        main(
+            [
+                str(prior),
+                "--identity",
+                one,
+                "--towards",
+                other,
+                *arguments,
+                "--elevation",
+                "0",
+                "--output",
+                str(out),
+            ]
+        )
+        == 0
+    )
+    assert (
+        main(
+            [str(prior), "--identity", other, *arguments, "--elevation", "0", "--output", str(tmp_path / "b")]
+        )
+        == 0
+    )
+    np.testing.assert_array_equal(read_image(out / "0002.png"), read_image(tmp_path / "b" / "0002.png"))
+    assert (read_image(out / "0000.png") != read_image(out / "0002.png")).any()
+    video, frames = cv2.VideoCapture(str(out / "orbit.webm")), 0
+    while video.read()[0]:
+        frames += 1
+    assert frames == 3
+    assert not [file for file in out.iterdir() if file.name.startswith(".")]
+
+
+def test_a_mesh_of_a_ball_is_round(prior, tmp_path):
+    path = tmp_path / "head.ply"
+    arguments = ["--identity", names(prior)[0], "--size", "4x4", "--output", str(tmp_path / "out")]
+    assert main([str(prior), *arguments, "--mesh", str(path), "--mesh-resolution", "24"]) == 0
+    mesh = o3d.io.read_triangle_mesh(str(path))
+    assert mesh.has_vertex_colors()
+    assert len(mesh.triangles) > 50
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        ([], 2, "--identity is needed"),
+        (["--identity", "nobody"], 1, "there is no 'nobody'"),
+        (["--identity", "FIRST", "--size", "12by3"], 2, "12by3"),
+        (["--identity", "FIRST", "--distance", "0.01"], 1, "move it away"),
+        (["--identity", "FIRST", "--cameras", "absent.json"], 1, "absent.json"),
+        (["--identity", "FIRST", "--alignment", "a.json"], 2, "--cameras"),
+        (["--identity", "FIRST", "--device", "cuda:77"], 2, "--device"),
+        (["--identity", "FIRST", "--mesh", "head.xyz"], 2, ".ply"),
+    ],
+)
+def test_what_cannot_be_is_told_before_anything_is_written(prior, tmp_path, arguments, status, words, capsys):
+    arguments = [names(prior)[0] if a == "FIRST" else a for a in arguments]
+    try:
+        ended = main([str(prior), "--output", str(tmp_path / "out"), *arguments])
+    except SystemExit as error:
+        ended = error.code
+    assert ended == status
+    assert words in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.png"))
+
+
+def test_a_folder_without_a_model_and_one_that_cannot_be_written_are_errors(prior, tmp_path, capsys):
+    assert main([str(tmp_path), "--output", str(tmp_path / "out")]) == 1
+    assert "model.json" in capsys.readouterr().err
+    (tmp_path / "file").touch()
+    assert main([str(prior), "--identity", names(prior)[0], "--output", str(tmp_path / "file" / "out")]) == 1
+    assert "file" in capsys.readouterr().err
