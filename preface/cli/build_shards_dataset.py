@@ -118,7 +118,8 @@ def _plan(config: argparse.Namespace) -> tuple[People, list[ShardTask]]:
     tasks = shard_tasks(people, choices, configuration, config.output, config.strict)
     if config.strict and people.left_out:
         raise strict_error(config.source, people.left_out[0])
-    splits([p.identity for p in people.people], config.holdout, config.seed, config.source)  # or say so now
+    names = [person.identity for person in people.people]
+    splits(names, config.holdout, config.seed, config.source, people.persons)  # or say so now
     return people, tasks
 
 

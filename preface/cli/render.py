@@ -92,6 +92,13 @@ def _parser() -> argparse.ArgumentParser:
         metavar="N",
         help="voxels along the box's longest side",
     )
+    mesh.add_argument(
+        "--surface",
+        type=_number(1e-3, 0.999),
+        default=0.5,
+        metavar="OPACITY",
+        help="the surface is where a centimetre stops this share of the light",
+    )
     speed = parser.add_argument_group("speed")
     speed.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
     speed.add_argument(

@@ -20,7 +20,7 @@ from preface.capture.rig import Rig, RigCamera, read_rig, write_rig
 from preface.cli.output import say
 from preface.cli.usage import UsageError
 from preface.geometry import Box, Camera, Rigid
-from preface.model.matmul import flush_denormals, keep_freed_memory
+from preface.model.matmul import denormals_flushed, keep_freed_memory
 from preface.model.model import PriorModel, Render
 from preface.model.rays import Rays
 from preface.model.rendering.image import RenderedImage, Space, render_image
@@ -39,7 +39,11 @@ def run(config: argparse.Namespace) -> list[str]:
     if config.mesh is not None and config.mesh.suffix not in MESH_SUFFIXES:
         raise UsageError(f"--mesh: {config.mesh.name} does not end in one of {', '.join(MESH_SUFFIXES)}")
     keep_freed_memory()
-    flush_denormals()
+    with denormals_flushed():
+        return _rendered(config)
+
+
+def _rendered(config: argparse.Namespace) -> list[str]:
     prior = read_prior(config.model)
     device = _device(config.device)
     box = Box(prior.scene.box[0], prior.scene.box[1])
@@ -102,10 +106,12 @@ def _mesh(config: argparse.Namespace, model: PriorModel, space: Space, weights: 
     """Write the surface of the first frame's code."""
     field = model_field(model, _code(model, weights), voxel_side(space, config.mesh_resolution))
     try:
-        mesh = extract_mesh(field, space, config.mesh_resolution, model.codes.device)
+        mesh = extract_mesh(field, space, config.mesh_resolution, config.surface, model.codes.device)
     except ValueError as error:
         field_name, _, problem = str(error).partition(": ")
-        raise ArtifactError(config.model, field_name, problem, "Train or fit the model further") from error
+        raise ArtifactError(
+            config.model, field_name, problem, "Train or fit further, or lower --surface"
+        ) from error
     say(f"mesh: {len(mesh.triangles)} triangles")
     return [str(write_mesh(config.mesh, mesh))]
 

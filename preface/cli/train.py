@@ -30,13 +30,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
     config = parse(sys.argv[1:] if arguments is None else arguments)
 
-    from preface.model.matmul import flush_denormals, keep_freed_memory
+    from preface.model.matmul import denormals_flushed, keep_freed_memory
     from preface.model.training.prior import TrainingError, train_prior
 
     keep_freed_memory()
-    flush_denormals()
     try:
-        ended = train_prior(config, say)
+        with denormals_flushed():
+            ended = train_prior(config, say)
     except (TrainingConfigError, ConfigurationError) as error:
         return _complain(str(error), 2)
     except (TrainingError, ArtifactError) as error:

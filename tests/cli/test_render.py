@@ -16,7 +16,7 @@ from preface.model.training.prior_files import read_prior
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model" / "training"))
 
-STEPS = ["--steps", "30", "--identities", "3", "--views", "2", "--rays", "64", "--log-every", "30"]
+STEPS = ["--steps", "20", "--identities", "3", "--views", "2", "--rays", "32"]
 
 
 @pytest.fixture(scope="module")
@@ -116,10 +116,14 @@ def test_codes_go_from_one_identity_to_another_and_a_video_has_every_frame(prior
     assert not [file for file in out.iterdir() if file.name.startswith(".")]
 
 
-def test_a_mesh_of_a_ball_is_round(prior, tmp_path):
+def test_a_mesh_lies_where_the_model_is_dense_enough_and_an_empty_model_has_none(prior, tmp_path, capsys):
     path = tmp_path / "head.ply"
-    arguments = ["--identity", names(prior)[0], "--size", "4x4", "--output", str(tmp_path / "out")]
-    assert main([str(prior), *arguments, "--mesh", str(path), "--mesh-resolution", "24"]) == 0
+    who = ["--identity", names(prior)[0], "--size", "4x4", "--output", str(tmp_path / "out")]
+    arguments = [str(prior), *who, "--mesh", str(path), "--mesh-resolution", "24"]
+    assert main([*arguments, "--surface", "0.999"]) == 1
+    assert "lower --surface" in capsys.readouterr().err
+    assert not path.exists()
+    assert main([*arguments, "--surface", "0.02"]) == 0
     mesh = o3d.io.read_triangle_mesh(str(path))
     assert mesh.has_vertex_colors()
     assert len(mesh.triangles) > 50

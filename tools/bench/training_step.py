@@ -31,7 +31,7 @@ from torch import Tensor
 
 from preface.model import coord, losses, stepfun, volume
 from preface.model.configuration import PRESETS, ModelConfig, preset
-from preface.model.matmul import choose_route, flush_denormals, keep_freed_memory, measure_route
+from preface.model.matmul import choose_route, denormals_flushed, keep_freed_memory, measure_route
 from preface.model.model import PriorModel
 from preface.model.rays import Rays
 from preface.model.training.progress import train_flops_per_ray
@@ -186,11 +186,11 @@ def main() -> int:
     options = parser.parse_args()
     torch.set_num_threads(1)
     keep_freed_memory()
-    flush_denormals()
     rows = []
     for name in options.presets:
         config = preset(name).resolved(SMALLEST_RADIUS)
-        rows += bench(name, config, options.rays or CHUNK[name], options.repeats)
+        with denormals_flushed():
+            rows += bench(name, config, options.rays or CHUNK[name], options.repeats)
     options.output.write_text(json.dumps({"torch": torch.__version__, "rows": rows}, indent=2) + "\n")
     print(table(rows))
     print(options.output)

@@ -1,6 +1,6 @@
 """The surface of a model as a triangle mesh: marching cubes on its density, then cleaned.
 
-The surface is where one voxel stops half the light that enters it. A field says nothing about the inside of what no
+The surface is where a centimetre stops a share of the light that enters it, half by default. A field says nothing about the inside of what no
 ray passes, so that it may be hollow or full of clutter there; only the largest connected surface is kept.
 """
 
@@ -23,6 +23,7 @@ from preface.model.model import PriorModel
 from preface.model.rendering.image import Space
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
+SURFACE_DEPTH = 0.01  # metres over which opacity at the surface is meant
 SLAB_POINTS = 65_536  # positions that are evaluated together
 
 
@@ -71,25 +72,28 @@ def model_field(model: PriorModel, code: Tensor | None, voxel: float) -> Field:
     def density(points: Tensor) -> Tensor:
         with torch.no_grad():
             found, biases = features(points)
-            return volume.density_from_raw(model.nerf.raw_density(found, biases[len(model.nerf.layers)]))[0]
+            return volume.density_from_raw(model.nerf.raw_density(found, biases[len(model.nerf.layers)]))
 
     def color(points: Tensor, directions: Tensor) -> Tensor:
         with torch.no_grad():
             found, biases = features(points)
             view = coord.pos_enc(directions, 0, model.config.view_levels)
             bias = biases[len(model.nerf.layers) + 1].expand(len(points), -1)
-            return volume.color_from_raw(model.nerf.raw_color(found, bias, view, model.products))[:, 0]
+            return volume.color_from_raw(model.nerf.raw_color(found, bias, view, model.products))
 
     return Field(density, color)
 
 
-def extract_mesh(field: Field, space: Space, resolution: int, device: torch.device | str = "cpu") -> Mesh:
+def extract_mesh(
+    field: Field, space: Space, resolution: int, opacity: float = 0.5, device: torch.device | str = "cpu"
+) -> Mesh:
     """Find the surface of a field inside the box.
 
     Args:
         field: for voxels of `voxel_side(space, resolution)`.
         space: of the model.
         resolution: voxels along the box's longest side.
+        opacity: what a centimetre stops of the light at the surface, between 0 and 1.
         device: where the field computes.
 
     Raises:
@@ -102,10 +106,10 @@ def extract_mesh(field: Field, space: Space, resolution: int, device: torch.devi
     side = voxel_side(space, resolution)
     first = space.box.minimum * space.scale
     counts = np.ceil((space.box.maximum - space.box.minimum) * space.scale / side - 1e-9).astype(int) + 1
-    # In units of optical depth per voxel, with a rim of nothing, so that the surface is closed at the box.
-    depth = np.pad(_sampled(field, first, counts, side, device) * side, 1)
-    # Halfway between nothing and a wall the logarithm is better behaved than the density, which spans decades.
-    height = np.log(np.maximum(depth, 1e-6) / math.log(2)).astype(np.float32)
+    # Optical depth of a centimetre, with a rim of nothing, so that the surface is closed at the box.
+    depth = np.pad(_sampled(field, first, counts, side, device) * (SURFACE_DEPTH * space.scale), 1)
+    # The logarithm is better behaved than the density, which spans decades.
+    height = np.log(np.maximum(depth, 1e-6) / -math.log1p(-opacity)).astype(np.float32)
     surface = o3d.t.geometry.TriangleMesh.create_isosurfaces(o3d.core.Tensor(height), [0.0])
     legacy = surface.to_legacy()
     if len(legacy.triangles) == 0:

@@ -110,8 +110,7 @@ def finish(
     """
     folder, configuration = built.tasks[0].folder, built.tasks[0].configuration
     identities = [identity for result in built.results for identity in result.identities]
-    imported = people.capture.manifest.metadata.get("imported", {})
-    divided = splits(identities, holdout, seed, source, imported.get("people", {}))
+    divided = splits(identities, holdout, seed, source, people.persons)
     choices = built.tasks[0].choices
     left_out = [*people.left_out, *built.left_out]
     settings: dict[str, Any] = {

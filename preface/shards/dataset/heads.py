@@ -134,7 +134,9 @@ class HeadMaker:
         lost = cut_off(pixels, white)
         shares = {f"brighter than the white of {white:g}": lost.above_white, "below zero": lost.below_black}
         return [
-            f"{100 * share:.2g}% of its values are {what} and cut off" for what, share in shares.items() if share
+            f"{100 * share:.2g}% of its values are {what} and cut off"
+            for what, share in shares.items()
+            if share
         ]
 
     def _segmenter(self, take: str) -> Segmenter:

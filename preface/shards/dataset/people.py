@@ -112,6 +112,11 @@ class People:
     left_out: tuple[LeftOut, ...]
     inputs: Mapping[str, Path]
 
+    @property
+    def persons(self) -> Mapping[str, str]:
+        """Identity -> person, where an imported capture has several identities of one person, as expressions."""
+        return self.capture.manifest.metadata.get("imported", {}).get("people", {})
+
 
 def find_people(
     source: Path,

@@ -10,15 +10,15 @@ from preface.geometry import Box
 from preface.model.configuration import ModelConfig, NetworkConfig
 from preface.model.model import PriorModel
 from preface.model.rendering.image import Space
-from preface.model.rendering.mesh import Field, extract_mesh, model_field, voxel_side, write_mesh
+from preface.model.rendering.mesh import Field, extract_mesh, model_field, write_mesh
 
 SPACE = Space(Box(np.array([-0.15, -0.2, -0.14]), np.array([0.15, 0.22, 0.16])), 1 / 0.21)
 CENTER, RADIUS = np.array([0.01, -0.02, 0.03]), 0.08  # metres
 
 
 def ball(steepness: float, floater: bool = False) -> Field:
-    """Density that grows exponentially through the sphere, where it stops half the light in a voxel of 1/64."""
-    middle = np.log(2) / voxel_side(SPACE, 64)
+    """Density that grows exponentially through the sphere, where it stops half the light in a centimetre."""
+    middle = np.log(2) / (0.01 * SPACE.scale)
 
     def density(points):
         inside = RADIUS - (points.double() / SPACE.scale - torch.from_numpy(CENTER)).norm(dim=-1)

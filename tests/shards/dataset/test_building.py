@@ -19,6 +19,7 @@ from preface.cli.build_shards import main
 from preface.geometry import Views, cast_rays
 from preface.shards import Dataset, verify
 from preface.shards.dataset.heads import HeadMaker
+from preface.shards.dataset.plan import splits
 
 ROOT = Path(__file__).parents[3]
 
@@ -208,15 +209,25 @@ def test_splits_hold_out_whom_they_should(studio, tmp_path):
     def held_out(*who):
         assert main(studio.arguments(tmp_path / "shards", "--holdout", *who)) == 0
         with Dataset(tmp_path / "shards") as dataset:
-            splits = dataset.manifest.splits
-        assert sorted((*splits["train"], *splits["holdout"])) == ["p0", "p1", "p2"]
-        return set(splits["holdout"])
+            found = dataset.manifest.splits
+        assert sorted((*found["train"], *found["holdout"])) == ["p0", "p1", "p2"]
+        return set(found["holdout"])
 
     assert held_out("p2", "p0") == {"p0", "p2"}
     assert len(held_out("1")) == len(held_out("33%")) == len(held_out("0.33")) == 1
     assert held_out("1") == held_out("1")
     by_seed = {held_out("1", "--seed", str(seed)).pop() for seed in range(8)}
     assert len(by_seed) > 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_expressions_of_a_person_are_all_on_one_side(seed):
+    persons = {f"p{person}-{frame}": f"p{person}" for person in range(5) for frame in range(3)}
+    divided = splits([*persons, "alone"], ["2"], seed, Path("capture"), persons)
+    sides = {side: {persons.get(name, name) for name in names} for side, names in divided.items()}
+    assert not sides["train"] & sides["holdout"]
+    assert len(sides["holdout"]) == 2
+    assert sorted([*divided["train"], *divided["holdout"]]) == sorted([*persons, "alone"])
 
 
 def test_the_papers_of_a_dataset(built):
