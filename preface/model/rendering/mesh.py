@@ -1,7 +1,8 @@
 """The surface of a model as a triangle mesh: marching cubes on its density, then cleaned.
 
-The surface is where a centimetre stops a share of the light that enters it, half by default. A field says nothing about the inside of what no
-ray passes, so that it may be hollow or full of clutter there; only the largest connected surface is kept.
+The surface is where a centimetre stops a share of the light that enters it, half by default. A field says nothing
+about the inside of what no ray passes, so that it may be hollow or full of clutter there; only the largest connected
+surface is kept.
 """
 
 from __future__ import annotations
