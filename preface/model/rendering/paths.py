@@ -75,7 +75,7 @@ def orbit(target: np.ndarray, frames: int, distance: float, azimuth: float, elev
 
 
 def framing_camera(half_sides: np.ndarray, distance: float, width: int, height: int) -> Camera:
-    """A pinhole that just sees a box from any side.
+    """A pinhole for portraits: the middle of the box just fills the image's height, and its sides may be cut.
 
     Args:
         half_sides: of the box [3], metres.
@@ -88,10 +88,8 @@ def framing_camera(half_sides: np.ndarray, distance: float, width: int, height: 
     radius = float(np.linalg.norm(half_sides))
     if distance <= radius:
         raise GeometryError(
-            f"distance: a camera {distance:.3g} m from the middle of a box that reaches {radius:.3g} m stands inside "
-            "it; move it away"
+            f"distance: a camera {distance:.3g} m from the middle of a box that reaches {radius:.3g} m stands "
+            "inside it; move it away"
         )
-    across, up = float(np.hypot(half_sides[0], half_sides[2])), float(half_sides[1])
-    depth = distance - across  # of the nearest faces, whatever the azimuth
-    focal = min(width / 2 / across, height / 2 / up) * max(depth, distance - radius)
+    focal = height / 2 / float(half_sides[1]) * distance
     return Camera("PINHOLE", width, height, np.array([focal, focal, width / 2, height / 2]))
