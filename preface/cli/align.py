@@ -10,9 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from preface.artifacts import ArtifactError
-from preface.cli.output import print_lines, whole_number
-from preface.cli.usage import UsageError
+from preface.cli.output import exit_status, resumable, whole_number
 
 _DESCRIPTION = "Find the face in every view and bring all faces into one canonical frame."
 _EPILOG = "Exit status: 0 when the alignment was written, 1 when something is wrong, 2 for wrong usage."
@@ -22,20 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
     parser = _parser()
     config = parser.parse_args(arguments)
-    try:
-        lines = config.run(config)
-    except UsageError as error:
-        config.parser.error(str(error))
-    except ArtifactError as error:
-        print(error, file=sys.stderr)
-        return 1
-    except _reasons() as error:
-        print(f"{config.source}: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("interrupted; run the same command again to resume", file=sys.stderr)
-        return 130  # 128 + SIGINT, as shells report it
-    return print_lines(lines)
+    return resumable(lambda: exit_status(lambda: config.run(config), config.parser, config.source, _reasons))
 
 
 def _reasons() -> tuple[type[Exception], ...]:

@@ -10,9 +10,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 
-from preface.artifacts import ArtifactError
-from preface.cli.output import print_lines, whole_number
-from preface.cli.usage import UsageError
+from preface.cli.output import exit_status, resumable, size, whole_number
 
 _DESCRIPTION = "Build a dataset of shards from a capture, its rigs and its alignment."
 _EPILOG = (
@@ -32,20 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     parser, run = _chosen(words)
     config = parser.parse_args(words)
-    try:
-        lines = run(config)
-    except UsageError as error:
-        parser.error(str(error))
-    except ArtifactError as error:
-        print(error, file=sys.stderr)
-        return 1
-    except _reasons() as error:
-        print(f"{parser.prog}: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("interrupted; run the same command again to resume", file=sys.stderr)
-        return 130  # 128 + SIGINT, as shells report it
-    return print_lines(lines)
+    return resumable(lambda: exit_status(lambda: run(config), parser, parser.prog, _reasons))
 
 
 def _reasons() -> tuple[type[Exception], ...]:
@@ -75,13 +60,6 @@ def _build(config: argparse.Namespace) -> list[str]:
 
 
 # --------------------------------------------------------------------------------------- the flags
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f"'{text}' is not WIDTHxHEIGHT, such as 512x768")
-    return int(width), int(height)
 
 
 def _positive(text: str) -> float:
@@ -119,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--resolution",
-        type=_size,
+        type=size,
         required=True,
         metavar="WIDTHxHEIGHT",
         help="size of all views, pixels, such as 512x768",

@@ -11,9 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from preface.artifacts import ArtifactError
-from preface.cli.output import print_lines, whole_number
-from preface.cli.usage import UsageError
+from preface.cli.output import exit_status, whole_number
 
 _DESCRIPTION = "Calibrate the cameras of a capture, or bring in the calibration of another program."
 _EPILOG = "Exit status: 0 when the rig was written, 1 when something is wrong, 2 for wrong usage."
@@ -37,17 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _keep_blas_to_one_thread()
     parser = _parser()
     config = parser.parse_args(arguments)
-    try:
-        lines = config.run(config)
-    except UsageError as error:
-        config.parser.error(str(error))
-    except ArtifactError as error:
-        print(error, file=sys.stderr)
-        return 1
-    except _reasons() as error:
-        print(f"{config.source}: {error}", file=sys.stderr)
-        return 1
-    return print_lines(lines)
+    return exit_status(lambda: config.run(config), config.parser, config.source, _reasons)
 
 
 def _keep_blas_to_one_thread() -> None:

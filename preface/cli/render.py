@@ -6,14 +6,11 @@ This module reads the command line; `render_frames` does the work and is importe
 
 import argparse
 import math
-import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from preface.artifacts import ArtifactError
-from preface.cli.output import print_lines, whole_number
-from preface.cli.usage import UsageError
+from preface.cli.output import exit_status, size, whole_number
 
 _DESCRIPTION = "Render what a model knows of a head: colour, opacity, depth and normals."
 _EPILOG = "Exit status: 0 when everything was written, 1 when something is wrong, 2 for wrong usage."
@@ -26,17 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from preface.cli.render_frames import run
     from preface.geometry import GeometryError
 
-    try:
-        lines = run(config)
-    except UsageError as error:
-        parser.error(str(error))
-    except ArtifactError as error:
-        print(error, file=sys.stderr)
-        return 1
-    except GeometryError as error:
-        print(f"preface-render: {error}", file=sys.stderr)
-        return 1
-    return print_lines(lines)
+    return exit_status(lambda: run(config), parser, parser.prog, lambda: (GeometryError,))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -75,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     image = parser.add_argument_group("the images")
     image.add_argument(
-        "--size", type=_size, metavar="WxH", help="of an orbit's images (default: those of training)"
+        "--size", type=size, metavar="WxH", help="of an orbit's images (default: those of training)"
     )
     image.add_argument(
         "--background", type=_number(0, 1), default=0.0, help="grey value behind the head, 0 to 1"
@@ -120,14 +107,6 @@ def _number(low: float, high: float) -> Callable[[str], float]:
         return value
 
     return number
-
-
-def _size(text: str) -> tuple[int, int]:
-    """The type of a flag that takes WxH."""
-    match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
-    if match is None:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a width and a height, such as 512x768")
-    return int(match[1]), int(match[2])
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ from preface.model.rendering.paths import framing_camera, on_sphere, orbit
 from preface.model.training.prior_files import Prior, read_prior
 from preface.plain_words import suggestion
 from preface.reports.pictures import Picture, as_picture, colorize
+from preface.shards.writer import box_depths
 
 CAMERAS_FILE, VIDEO_FILE = "rig.json", "orbit.webm"
 FRAMES_PER_SECOND = 24
@@ -188,7 +189,7 @@ def _write(folder: Path, name: str, image: RenderedImage, box: Box, pose: Rigid,
     picture = as_picture(image.rgb)
     write_png(folder / f"{name}.png", picture)
     write_png(folder / f"{name}.alpha.png", np.rint(image.alpha * 255).astype(np.uint8))
-    near, far = _depth_range(box, pose)
+    near, far = box_depths(np.stack([box.minimum, box.maximum]), pose.matrix[:3])
     write_png(folder / f"{name}.depth.png", colorize(image.depth, near, far, "viridis"))
     channels: dict[str, Any] = {"Z": image.depth}
     if image.normals is not None:
@@ -199,13 +200,6 @@ def _write(folder: Path, name: str, image: RenderedImage, box: Box, pose: Rigid,
         colors = {c: np.ascontiguousarray(image.rgb[..., i]) for i, c in enumerate("RGB")}
         write_exr(folder / f"{name}.exr", {**colors, "A": image.alpha, **channels})
     return picture
-
-
-def _depth_range(box: Box, pose: Rigid) -> tuple[float, float]:
-    """The depths of the box in front of a camera."""
-    corners = np.stack(np.meshgrid(*zip(box.minimum, box.maximum, strict=True), indexing="ij"), -1)
-    depths = pose.inverse.apply(corners.reshape(-1, 3))[:, 2]
-    return max(float(depths.min()), 0.0), max(float(depths.max()), 1e-6)
 
 
 class _Video:
