@@ -172,14 +172,19 @@ def _ids(paths: list[Path]) -> list[str]:
     names = [
         path.stem if stems[path.stem.casefold()] == 1 else f"{path.parent.name}-{path.stem}" for path in paths
     ]
-    names = [re.sub(r"[^A-Za-z0-9._-]", "_", name)[:100] for name in names]
-    names = [name if name[0].isalnum() else f"photo{name}"[:100] for name in names]
+    names = [camera_name(name) for name in names]
     taken: dict[str, Path] = {}
     for name, path in zip(names, paths, strict=True):
         if other := taken.get(name.casefold()):
             raise PhotoError(path, "name", f"becomes '{name}', as {other} does", "Rename or remove one")
         taken[name.casefold()] = path
     return names
+
+
+def camera_name(name: str) -> str:
+    """What a rig calls the camera of a photograph of this name."""
+    allowed = re.sub(r"[^A-Za-z0-9._-]", "_", name)[:100]
+    return allowed if allowed[0].isalnum() else f"photo{allowed}"[:100]
 
 
 def _exif_focal(path: Path, header: ImageHeader) -> float | None:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from preface.model.metrics.image_quality import psnr
 from preface.model.model import PriorModel
+from preface.model.rendering.image import SEEN
 from preface.model.training.data import TrainingData, WholeViews, frontal_view
 from preface.model.training.prior_loss import rays_of, target_colors
 from preface.model.training.trainer import slice_batch
@@ -25,7 +26,6 @@ from preface.shards import Batch, Loader
 MAX_ROWS = 12  # of a sheet of views; more is no longer looked at
 STEPS_BETWEEN = 7  # faces per row of an interpolation, both ends included
 _ERROR_SHOWN = 0.25  # the mean absolute error, of 1, at the bright end of the error map
-_SEEN = 0.5  # opacity from which a depth is shown
 _BEST_PSNR = 100.0  # dB, in place of infinity
 
 
@@ -104,7 +104,7 @@ class Viewer:
                 rays = rays_of(part, self.model, self.planes, self.data.dataset.manifest.views)
                 seen = self.model(rays, code[None])
                 colors.append(seen.rgb.cpu())
-                depth = torch.where(seen.acc > _SEEN, seen.distance_median, torch.nan)
+                depth = torch.where(seen.acc > SEEN, seen.distance_median, torch.nan)
                 depths.append(depth.cpu() / self.data.scene.scene_scale)
         return (
             torch.cat(colors).view(height, width, 3).numpy(),

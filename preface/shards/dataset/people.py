@@ -5,7 +5,6 @@ Nobody is left out without a word: what cannot be used comes back as `LeftOut`, 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from preface.capture.manifest import (
     Take,
     read_capture,
 )
+from preface.capture.photos.files import camera_name
 from preface.capture.rig import Rig, RigCamera
 from preface.capture.upright import read_upright_header
 from preface.geometry import Similarity
@@ -205,7 +205,7 @@ def capture_of_photographs(folder: Path, index: AlignmentIndex, masks: Path | No
         remedy = "Name a capture, or the folder of one person's photographs and its alignment"
         raise ArtifactError(folder, "folder", problem, remedy)
     given = {file.stem: file for file in _images(masks)} if masks else {}
-    photographs = {_camera_name(file): file for file in files}
+    photographs = {camera_name(file.stem): file for file in files}
     if len(photographs) < len(files):
         problem = "two photographs differ in nothing but their suffix, or in signs that names of cameras lack"
         raise ArtifactError(folder, "photographs", problem, "Rename or remove one, and align again")
@@ -225,12 +225,6 @@ def _images(folder: Path) -> list[Path]:
         return sorted(f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and f.is_file())
     except OSError as error:
         raise ArtifactError.from_os(folder, "folder", error) from error
-
-
-def _camera_name(file: Path) -> str:
-    """The name of a photograph's camera in the rig that `preface-align photos` writes."""
-    name = re.sub(r"[^A-Za-z0-9._-]", "_", file.stem)[:100]
-    return name if name[0].isalnum() else f"photo{name}"[:100]
 
 
 # ----------------------------------------------------------------------------------------- people
