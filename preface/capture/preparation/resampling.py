@@ -15,6 +15,7 @@ from preface.capture.preparation.transfer import (
     Reader,
     bytes_of_light,
     bytes_of_values,
+    premultiplied_reader,
     reader,
 )
 from preface.capture.preparation.undistortion import Pinhole, Route
@@ -96,6 +97,39 @@ class Resampler:
         if shares is not None:
             values /= np.maximum(shares, _SHOWN)
             values *= shares > _SHOWN
+        return self._bytes(values)
+
+    def foreground(self, pixels: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The photograph's colours, unmixed at the edges of its foreground, and the foreground's share.
+
+        A result pixel that shows some foreground has the mean colour of that alone, weighted by alpha: the
+        colour that over any background, composited by its share, gives what a camera would have seen. Other
+        pixels have the photograph's colour.
+
+        Args:
+            pixels: as `colors` takes them.
+            alpha: as `coverage` takes it.
+
+        Returns:
+            uint8 [H, W, 3], sRGB, and uint8 [H, W].
+
+        Raises:
+            PreparationError: as `colors` and `coverage`.
+        """
+        colors, coverage = self.colors(pixels), self.coverage(alpha)
+        shown = coverage > 0
+        if not shown.any() or (alpha == alpha.max()).all():
+            return colors, coverage
+        both = _with_alpha(self._checked("pixels", pixels, (1, 3, 4)), alpha)
+        channels = both.shape[2]
+        read = premultiplied_reader(both.dtype, self.options.light, self.options.white, channels)
+        values, _ = self._filtered(both, read)
+        values, shares = values[..., :-1], values[..., -1:]
+        shown &= shares[..., 0] > _SHOWN  # of a filter with negative lobes, all may cancel out
+        unmixed = self._bytes(values / np.maximum(shares, _SHOWN))
+        return np.where(shown[..., None], unmixed, colors), coverage
+
+    def _bytes(self, values: np.ndarray) -> np.ndarray:
         coded = bytes_of_light(values) if self.options.light == "linear" else bytes_of_values(values)
         return coded if coded.shape[2] == 3 else np.repeat(coded, 3, axis=2)
 
@@ -182,6 +216,17 @@ def split_alpha(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         return _without_alpha(pixels), np.ascontiguousarray(pixels[..., 3])
     return pixels, None
+
+
+def _with_alpha(pixels: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Colours [h, w, c] and alpha [h, w] as one image of the colours' type; an alpha of their own is replaced."""
+    given = alpha.reshape(*pixels.shape[:2], 1)
+    if given.dtype != pixels.dtype:
+        share = given / np.float32(np.iinfo(given.dtype).max) if given.dtype.kind in "u" else given
+        most = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
+        scaled = np.clip(share, 0, 1) * np.float32(most)
+        given = (np.rint(scaled) if most > 1 else scaled).astype(pixels.dtype)
+    return np.concatenate([pixels[..., : 3 if pixels.shape[2] > 1 else 1], given], axis=-1)
 
 
 def _without_alpha(pixels: np.ndarray) -> np.ndarray:

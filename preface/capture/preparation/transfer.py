@@ -68,6 +68,26 @@ def reader(dtype: np.dtype, meaning: Light | Literal["alpha"], white: float) -> 
     return lambda rows, out: np.take(table, rows, out=out, mode="clip")
 
 
+def premultiplied_reader(dtype: np.dtype, meaning: Light, white: float, channels: int) -> Reader:
+    """As `reader`, of images whose last channel is an alpha: colours times it, and the alpha itself.
+
+    Args:
+        dtype, meaning, white: as `reader` takes them; the meaning is that of the colours.
+        channels: of the image, with the alpha.
+    """
+    colors, alphas = reader(dtype, meaning, white), reader(dtype, "alpha", white)
+
+    def read(rows: np.ndarray, out: np.ndarray) -> None:
+        colors(rows, out)
+        taken, into = (x.reshape(len(x), -1, channels) if x.ndim == 2 else x for x in (rows, out))
+        alpha = np.empty(into.shape[:2], np.float32)
+        alphas(taken[..., -1], alpha)
+        into[..., :-1] *= alpha[..., None]
+        into[..., -1] = alpha
+
+    return read
+
+
 def as_they_are(rows: np.ndarray, out: np.ndarray) -> None:
     """The reader of what is light already, float32."""
     np.copyto(out, rows)

@@ -114,8 +114,7 @@ class HeadMaker:
             path=view.photograph,
         )
         foreground = self._segmenter(person.take)(pixels, hints)
-        coverage = resampler.coverage(foreground.alpha)
-        colors = resampler.colors(foreground.pixels)
+        colors, coverage = resampler.foreground(foreground.pixels, foreground.alpha)
         rig_from_camera = view.rig_camera.camera_from_rig.inverse
         pose = person.canonical_from_rig.apply_to_pose(rig_from_camera)
         remarks = [*foreground.notes, *self._light_cut_off(pixels)]

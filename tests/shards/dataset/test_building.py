@@ -61,12 +61,14 @@ def test_the_dataset_is_whole_and_says_where_it_comes_from(studio, built):
 
 
 def test_pixels_are_means_of_the_photograph_and_its_mask(studio, built):
-    """The reduction is 4 to 1: every pixel covers sixteen."""
+    """The reduction is 4 to 1: of the sixteen that a pixel covers, those of the foreground count, if any."""
     source = read_image(studio.capture / "subjects/p1/left.png").astype(np.float64) / 255
     light = np.where(source <= 0.04045, source / 12.92, ((source + 0.055) / 1.055) ** 2.4)
-    mean = light.reshape(32, 4, 24, 4, 3).mean(axis=(1, 3))
+    masks = made_up_capture.mask().reshape(32, 4, 24, 4).astype(np.float64)
+    mask = masks.mean(axis=(1, 3))
+    weights = np.where(mask[:, None, :, None] > 0, masks, 1.0)[..., None]
+    mean = (weights * light.reshape(32, 4, 24, 4, 3)).sum(axis=(1, 3)) / weights.sum(axis=(1, 3))
     expected = 255 * np.where(mean <= 0.0031308, mean * 12.92, 1.055 * mean ** (1 / 2.4) - 0.055)
-    mask = made_up_capture.mask().reshape(32, 4, 24, 4).mean(axis=(1, 3))
     with Dataset(built) as dataset:
         pixels = dataset.pixels(1, 0).astype(np.float64)
     assert np.abs(pixels[..., :3] - expected).max() <= 0.51
