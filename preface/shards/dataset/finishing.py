@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from preface.align.alignment_files import TEMPLATE_FILE
 from preface.artifacts import ArtifactError, provenance, write_bytes
 from preface.capture.foreground.sheet import MaskFigures, mask_report
 from preface.shards.building import build_manifest, claim
 from preface.shards.dataset.croissant import CROISSANT_FILE, croissant
 from preface.shards.dataset.data_card import CARD_FILE, Contents, data_card
 from preface.shards.dataset.heads import mask_figures
-from preface.shards.dataset.people import LeftOut, People
+from preface.shards.dataset.people import TEMPLATE_INPUT, LeftOut, People
 from preface.shards.dataset.plan import ShardTask, splits
 from preface.shards.dataset.tasks import TaskResult
 from preface.shards.format import shard_name, shard_number
@@ -94,7 +95,10 @@ def finish(
     seed: int,
     name: str,
 ) -> Path:
-    """Write the page of masks, the data card, the Croissant description and the manifest.
+    """Write the page of masks, the data card, the Croissant description, the template and the manifest.
+
+    The template is a copy of the alignment's: whoever is to be fitted by a prior of these shards later has to be
+    placed on it.
 
     Shards of an earlier dataset that are no longer part of it are removed.
 
@@ -128,6 +132,7 @@ def finish(
     pages = {"Masks over the photographs, worst first": MASKS_FILE}
     write_bytes(folder / CARD_FILE, data_card(contents, left_out, pages).encode())
     write_bytes(folder / CROISSANT_FILE, croissant(contents).encode())
+    write_bytes(folder / TEMPLATE_FILE, people.inputs[TEMPLATE_INPUT].read_bytes())
     manifest = build_manifest(
         folder,
         len(built.tasks),

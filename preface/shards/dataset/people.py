@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from preface.align.alignment_files import AlignmentIndex, read_index
+from preface.align.alignment_files import TEMPLATE_FILE, AlignmentIndex, read_index
 from preface.align.person_file import Alignment, read_alignment
 from preface.artifacts import ArtifactError, sha256
 from preface.capture.images import IMAGE_SUFFIXES, read_header
@@ -31,6 +31,7 @@ from preface.capture.upright import read_upright_header
 from preface.geometry import Similarity
 from preface.plain_words import suggestion
 
+TEMPLATE_INPUT = f"alignment/{TEMPLATE_FILE}"
 MIRRORED = "mirrored"  # the alignment's word for a photograph that was turned over
 
 
@@ -103,7 +104,7 @@ class People:
         people: with at least one view.
         cameras: names of all cameras that have a view of somebody, in the capture's order.
         left_out: people and views that cannot be used.
-        inputs: name -> file of what they were read from, for provenance.
+        inputs: name -> file of what they were read from, for provenance; `TEMPLATE_INPUT` is the template.
     """
 
     capture: Capture
@@ -143,6 +144,7 @@ def find_people(
     index = read_index(alignment)
     capture = read_capture(source) if is_capture(source) else capture_of_photographs(source, index, masks)
     inputs = {f"rigs/{take}.json": file for take, (file, _) in rigs.items()}
+    inputs[TEMPLATE_INPUT] = alignment / TEMPLATE_FILE
     if not capture.inferred:
         inputs[FILE_NAME] = capture.directory / FILE_NAME
     subjects = chosen_subjects(source, capture, only)

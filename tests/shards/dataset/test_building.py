@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from made_up_capture import CAMERAS, contents, write_studio
 
+from preface.artifacts import sha256
 from preface.capture.images import read_image, write_png
 from preface.cli.build_shards import main
 from preface.geometry import Views, cast_rays
@@ -242,6 +243,13 @@ def test_the_papers_of_a_dataset(built):
     assert digests == {shard["file"]: shard["sha256"] for shard in manifest["shards"]}
     assert "9 photographs" in (built / "masks.html").read_text()
     assert [row["identities/identity"] for row in described["recordSet"][0]["data"]] == ["p0", "p1", "p2"]
+
+
+def test_the_template_goes_with_the_shards(studio, built):
+    """Whoever is fitted later by a prior of these shards is placed on it."""
+    assert (built / "template.json").read_bytes() == (studio.alignment / "template.json").read_bytes()
+    inputs = json.loads((built / "manifest.json").read_text())["provenance"]["inputs"]
+    assert inputs["alignment/template.json"] == sha256(built / "template.json")
 
 
 def test_photographs_of_one_person_become_a_dataset(own, tmp_path):
