@@ -17,7 +17,7 @@ cameras, no faces, no networks.
 >>> page = report.write(Path("calibration/report.html"))  # doctest: +SKIP
 """
 
-from preface.reports.blocks import KeyFigure
+from preface.reports.blocks import KeyFigure, Link
 from preface.reports.page import Report, Section
 from preface.reports.pictures import (
     colorize,
@@ -32,6 +32,7 @@ from preface.reports.values import Target
 
 __all__ = [
     "KeyFigure",
+    "Link",
     "Report",
     "Section",
     "Target",

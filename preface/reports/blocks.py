@@ -3,6 +3,7 @@
 The page's template draws the same blocks by their ``kind``.
 """
 
+import base64
 import hashlib
 from dataclasses import asdict, dataclass, field
 from typing import Any, ClassVar, Literal
@@ -102,4 +103,46 @@ class Picture:
         return {"kind": self.kind, **entry, "sha256": hashlib.sha256(self.content).hexdigest()}
 
 
-Block = Text | KeyFigures | Table | Picture
+@dataclass(frozen=True)
+class Video:
+    """A WebM file, played in the page."""
+
+    kind: ClassVar[str] = "video"
+    caption: str
+    alt: str
+    content: bytes = field(repr=False)
+    width: int  # CSS pixels
+    height: int
+
+    @property
+    def uri(self) -> str:
+        """The video as the page holds it."""
+        return f"data:video/webm;base64,{base64.b64encode(self.content).decode('ascii')}"
+
+    def twin(self) -> dict[str, Any]:
+        """The block for the twin; the video itself by its sha256."""
+        entry = {name: value for name, value in asdict(self).items() if name != "content"}
+        return {"kind": self.kind, **entry, "sha256": hashlib.sha256(self.content).hexdigest()}
+
+
+@dataclass(frozen=True)
+class Link:
+    """A file near the page: what it is, and its path from the page's folder, with forward slashes."""
+
+    text: str
+    path: str
+
+
+@dataclass(frozen=True)
+class Links:
+    """Files near the page, which do not travel with it."""
+
+    kind: ClassVar[str] = "links"
+    links: tuple[Link, ...]
+
+    def twin(self) -> dict[str, Any]:
+        """The block for the twin."""
+        return {"kind": self.kind, "links": [asdict(link) for link in self.links]}
+
+
+Block = Text | KeyFigures | Table | Picture | Video | Links

@@ -1,6 +1,6 @@
 """Reports: sections of text, key figures, tables and pictures, as one HTML file and its JSON twin.
 
-The page stands alone: style, script and pictures are inside it, and its content security policy forbids
+The page stands alone: style, script, pictures and videos are inside it, and its content security policy forbids
 everything else. The twin holds the same figures at full precision for machines, and the sha256 of every
 picture. The same input gives the same bytes.
 """
@@ -16,13 +16,25 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from preface.artifacts import write_artifact, write_bytes
-from preface.reports.blocks import Block, Column, KeyFigure, KeyFigures, Picture, Table, Text
+from preface.reports.blocks import (
+    Block,
+    Column,
+    KeyFigure,
+    KeyFigures,
+    Link,
+    Links,
+    Picture,
+    Table,
+    Text,
+    Video,
+)
 from preface.reports.pictures import as_picture
 from preface.reports.plots import encode_figure, encode_picture
 from preface.reports.values import Target, Value, encodable, is_number, json_tree, plain, shown
 
 SCHEMA = "preface/report"
 SCHEMA_VERSION = 1
+_EBML = b"\x1a\x45\xdf\xa3"  # what WebM files begin with
 
 
 class Section:
@@ -124,6 +136,35 @@ class Section:
         width, height = (round(inches * 96) for inches in figure.get_size_inches())  # CSS: 96 pixels per inch
         self._add_picture(caption, alt, kind, encode_figure(figure, kind), width, height)
 
+    def video(self, content: bytes, size: tuple[int, int], caption: str, alt: str) -> None:
+        """Adds a video that plays in the page.
+
+        Args:
+            content: of a WebM file.
+            size: width and height to show it at, CSS pixels.
+            caption: shown below it.
+            alt: what a reader who cannot see the video should know.
+
+        Raises:
+            ValueError: not a WebM file, or an empty ``alt``.
+        """
+        if not content.startswith(_EBML):
+            raise ValueError(f"video {caption!r} is not a WebM file")
+        self.blocks.append(Video(caption, _required_alt("video", caption, alt), content, *size))
+
+    def links(self, links: Sequence[Link]) -> None:
+        """Adds a list of files near the page.
+
+        Raises:
+            ValueError: no links, or a path that is absolute or leads to the network.
+        """
+        for link in links:
+            if link.path.startswith(("/", "\\")) or ":" in link.path.split("/")[0]:
+                raise ValueError(f"link {link.text!r}: {link.path} is not a path from the page's folder")
+        if not links:
+            raise ValueError("links: there are none")
+        self.blocks.append(Links(tuple(links)))
+
     def _add_picture(
         self,
         caption: str,
@@ -133,8 +174,7 @@ class Section:
         width: int,
         height: int,
     ) -> None:
-        if not alt.strip():
-            raise ValueError(f"picture {caption!r} needs an alt text for readers who cannot see it")
+        alt = _required_alt("picture", caption, alt)
         self.blocks.append(Picture(caption, alt, kind, content, width, height))
 
 
@@ -185,6 +225,12 @@ class Report:
         write_bytes(path, encodable(self.html()).encode())
         write_artifact(path.with_suffix(".json"), self.twin())
         return path
+
+
+def _required_alt(what: str, caption: str, alt: str) -> str:
+    if not alt.strip():
+        raise ValueError(f"{what} {caption!r} needs an alt text for readers who cannot see it")
+    return alt
 
 
 def _sorted_rows(rows: list[dict[str, Value]], name: str, descending: bool) -> list[dict[str, Value]]:

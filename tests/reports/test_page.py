@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from preface.artifacts import ArtifactError, read_artifact
-from preface.reports import KeyFigure, Report, Target, new_figure
+from preface.reports import KeyFigure, Link, Report, Target, new_figure
 from preface.reports.values import shown
 
 HOSTILE = "</title></style></script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&{{ 7 * 7 }}"
@@ -334,3 +334,39 @@ def test_a_target_is_written_as_briefly_as_it_was_asked():
 )
 def test_numbers_are_printed_to_four_digits(value, text):
     assert shown(value) == text
+
+
+WEBM = b"\x1a\x45\xdf\xa3" + bytes(60)
+
+
+def test_a_video_is_inside_the_page_and_links_lead_to_its_neighbours(tmp_path):
+    report = Report("Orbit", {})
+    section = report.section("Around the head")
+    section.video(WEBM, (96, 144), "Twelve views", "A head that turns")
+    section.links([Link("masks", "shards/masks & more.html"), Link("<b>rigs</b>", "rigs")])
+    page = Page(report.write(tmp_path / "orbit.html").read_text())
+    ((video, _),) = page.all("video")
+    assert base64.b64decode(video["src"].removeprefix("data:video/webm;base64,")) == WEBM
+    assert video["aria-label"] == "A head that turns"
+    found = {text: attrs["href"] for attrs, text in page.all("a")}
+    assert found == {"masks": "shards/masks%20%26%20more.html", "<b>rigs</b>": "rigs"}
+    twin = read_artifact(tmp_path / "orbit.json", "preface/report")
+    assert twin["sections"][0]["blocks"][0]["sha256"] == hashlib.sha256(WEBM).hexdigest()
+    assert twin["sections"][0]["blocks"][1]["links"][0] == {
+        "text": "masks",
+        "path": "shards/masks & more.html",
+    }
+
+
+@pytest.mark.parametrize("path", ["/etc/passwd", "https://example.org", "javascript:alert(1)", "\\\\host\\x"])
+def test_a_link_leads_nowhere_but_near_the_page(path):
+    with pytest.raises(ValueError, match="not a path from the page's folder"):
+        Report("x", {}).section("y").links([Link("z", path)])
+
+
+def test_what_is_no_video_is_refused():
+    section = Report("x", {}).section("y")
+    with pytest.raises(ValueError, match="not a WebM file"):
+        section.video(b"GIF89a", (1, 1), "caption", "alt")
+    with pytest.raises(ValueError, match="alt text"):
+        section.video(WEBM, (1, 1), "caption", " ")
