@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 
 from preface.capture.boards import board_points, marker_corners, marker_dictionary
-from preface.capture.images import display_tones, light_of_levels
+from preface.capture.images import display_tones
 from preface.capture.manifest import Board
 from preface.capture.subpixel import Junction, Refined, Surroundings, refine
 from preface.geometry.conventions import pixels_from_opencv
+from preface.srgb import light_of_levels
 
 SEARCH_SIDE = 2048  # pixels; markers are found faster, and large ones better, in a reduced image
 CHESSBOARD_SIDE = 1280  # likewise for chessboards, which are searched for more slowly

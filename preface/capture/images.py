@@ -16,7 +16,6 @@ import os
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -264,17 +263,6 @@ def display_tones(pixels: np.ndarray) -> np.ndarray:
     white = float(np.percentile(light[finite], DISPLAY_WHITE)) if finite.any() else 1.0
     share = np.where(np.isnan(light), np.float32(0), light) / np.float32(max(white, 1e-9))
     return np.rint(255 * np.clip(share, 0, 1) ** (1 / DISPLAY_GAMMA)).astype(np.uint8)
-
-
-@cache
-def light_of_levels(dtype: np.dtype) -> np.ndarray:
-    """The linear light, float32 in [0, 1], of every sRGB level of an unsigned integer type (IEC 61966-2-1)."""
-    top = np.iinfo(dtype).max
-    encoded = np.arange(top + 1, dtype=np.float32) / top
-    curve = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    light = curve.astype(np.float32)
-    light.setflags(write=False)
-    return light
 
 
 # ---------------------------------------------------------------------------------------- headers

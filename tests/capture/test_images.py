@@ -17,7 +17,6 @@ from preface.capture.images import (
     ImageHeader,
     display_tones,
     displayable,
-    light_of_levels,
     read_exr,
     read_header,
     read_image,
@@ -326,13 +325,3 @@ def test_what_is_no_number_shows_black_and_dims_nothing():
     assert shown[0, :4].tolist() == [0, 255, 0, 0]
     assert (shown[1:] == 255).all()
     assert (displayable(np.full((3, 3), np.nan, np.float32)) == 0).all()
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_light_of_levels_undoes_the_srgb_encoding(dtype):
-    light = light_of_levels(np.dtype(dtype)).astype(np.float64)
-    levels = np.arange(len(light)) / (len(light) - 1)
-    encoded = np.where(
-        light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055
-    )
-    np.testing.assert_allclose(encoded, levels, atol=2e-6)

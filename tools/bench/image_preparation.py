@@ -34,9 +34,10 @@ import numpy as np
 from preface.artifacts import provenance, write_bytes
 from preface.capture.images import read_header, read_image, write_exr, write_jpeg, write_png
 from preface.capture.preparation import PreparationOptions, Resampler, framing_window, split_alpha
-from preface.capture.preparation.transfer import bytes_of_light, decode, encode, reader
+from preface.capture.preparation.transfer import bytes_of_light, reader
 from preface.capture.preparation.undistortion import Route
 from preface.geometry import Camera, lens
+from preface.srgb import decode, encode
 
 MADE = (4096, 6144)
 DISTORTION = (-0.1, 0.05, 1e-4, -2e-4)  # k1 k2 p1 p2 of a good studio lens

@@ -5,7 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from preface.capture.images import light_of_levels, read_image
+from preface.capture.images import read_image
+from preface.srgb import light_of_levels
 
 
 def read_texture(path: Path) -> np.ndarray:

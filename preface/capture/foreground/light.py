@@ -10,7 +10,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from preface.capture.images import DISPLAY_WHITE, light_of_levels
+from preface.capture.images import DISPLAY_WHITE
+from preface.srgb import encode, light_of_levels
 
 WORK_SIDE = 1024  # pixels: longest side of the reduced image, on which decisions are made
 SAMPLES_FOR_WHITE = 2**20  # pixels that are looked at to find what white is in a float image
@@ -90,11 +91,11 @@ class Light:
         dtype = self._image.dtype
         if not np.issubdtype(dtype, np.integer):
             return (light * self.white).astype(dtype)
-        return np.rint(_srgb(light) * np.iinfo(dtype).max).astype(dtype)
+        return np.rint(encode(np.clip(light, 0, 1)) * np.iinfo(dtype).max).astype(dtype)
 
     def encode_display(self, light: np.ndarray) -> np.ndarray:
         """Light [..., 3] as 8-bit sRGB, which networks look at."""
-        return np.rint(_srgb(light) * 255).astype(np.uint8)
+        return np.rint(encode(np.clip(light, 0, 1)) * 255).astype(np.uint8)
 
     def quantisation(self, light: np.ndarray) -> np.ndarray:
         """Light between two levels of the photograph's type at values of light of any shape; 0 for floats."""
@@ -104,12 +105,6 @@ class Light:
         table = light_of_levels(dtype)
         level = np.searchsorted(table, np.clip(light, 0, 1)).clip(1, len(table) - 1)
         return table[level] - table[level - 1]
-
-
-def _srgb(light: np.ndarray) -> np.ndarray:
-    """The sRGB encoding of light, clipped to [0, 1] (IEC 61966-2-1)."""
-    clipped = np.clip(light, 0, 1)
-    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
 
 
 def _white(image: np.ndarray) -> float:

@@ -15,8 +15,8 @@ from typing import Literal
 
 import numpy as np
 
-from preface.capture.images import light_of_levels
 from preface.capture.preparation.options import Light, PreparationError
+from preface.srgb import decode, encode, light_of_levels
 
 # Steps of the table that finds an sRGB byte: finer than the closest two thresholds, 1 / 255 / 12.92 apart, so
 # that a step holds no more than one of them.
@@ -116,18 +116,6 @@ def _float_reader(meaning: Light, white: float) -> Reader:
             out[...] = encode(out)
 
     return read
-
-
-def encode(light: np.ndarray) -> np.ndarray:
-    """The sRGB values in [0, 1] of linear light in [0, 1] (IEC 61966-2-1), in the same precision."""
-    power = 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055
-    return np.where(light <= 0.0031308, light * 12.92, power).astype(light.dtype)
-
-
-def decode(encoded: np.ndarray) -> np.ndarray:
-    """The linear light of sRGB values in [0, 1] (IEC 61966-2-1), in the same precision."""
-    power = ((np.maximum(encoded, 0.04045) + 0.055) / 1.055) ** 2.4
-    return np.where(encoded <= 0.04045, encoded / 12.92, power).astype(encoded.dtype)
 
 
 def bytes_of_light(light: np.ndarray) -> np.ndarray:

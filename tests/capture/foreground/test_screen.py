@@ -5,7 +5,7 @@ import pytest
 from drawn_person import GREEN, iou, person, photograph, screen
 
 from preface.capture.foreground import ForegroundError, Hints, make_segmenter
-from preface.capture.images import light_of_levels
+from preface.srgb import light_of_levels
 
 BLACK = np.zeros(3)
 

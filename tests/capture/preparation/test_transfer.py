@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from preface.capture.images import light_of_levels
 from preface.capture.preparation import PreparationError, cut_off
-from preface.capture.preparation.transfer import bytes_of_light, bytes_of_values, decode, encode, reader
+from preface.capture.preparation.transfer import bytes_of_light, bytes_of_values, reader
+from preface.srgb import decode, encode, light_of_levels
 
 
 def srgb(light):
