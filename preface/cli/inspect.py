@@ -18,11 +18,13 @@ if TYPE_CHECKING:  # these need numpy; --help must not wait for it
     from preface.capture.manifest import Capture
 
 _DESCRIPTION = (
-    "Validate captures, rigs, alignments and reports, and datasets of shards, print what they hold, "
+    "Validate captures, rigs, alignments, shards, priors, heads, figures and reports, print what they hold, "
     "and say what is wrong with them."
 )
 _EPILOG = "Exit status: 0 when all is well, 1 when something is wrong, 2 for wrong usage."
-_PATH_HELP = "an artefact, or a folder of a capture, a rig, an alignment or shards"
+_PATH_HELP = (
+    "an artefact, or a folder of a capture, a rig, an alignment, shards, a prior, a head or its figures"
+)
 MAX_LISTED = 20  # problems and missing views beyond this are counted; --json lists them all
 
 
@@ -35,6 +37,7 @@ _NAMES = {
     "template.json": "preface/template",
     "manifest.json": "preface/shards",
     "model.json": "preface/prior",
+    "metrics.json": "preface/metrics",
 }
 _SHARDS = "shard-*.safetensors"
 
@@ -116,6 +119,7 @@ def _inspect_artifact(report: Report) -> Report:
         "preface/landmarks": _summarise_alignment,
         "preface/report": _summarise_report,
         "preface/prior": _summarise_prior,
+        "preface/metrics": _summarise_metrics,
         "preface/shards": _summarise_shards,
         "preface/shard": _summarise_shards,
     }
@@ -281,6 +285,12 @@ def _summarise_prior(report: Report) -> None:
     from preface.cli import inspect_prior
 
     report.summary = inspect_prior.summarise_prior(report.path, report.problems)
+
+
+def _summarise_metrics(report: Report) -> None:
+    from preface.cli import inspect_metrics
+
+    report.summary = inspect_metrics.summarise_metrics(report.path)
 
 
 def _summarise_shards(report: Report) -> None:

@@ -1,7 +1,10 @@
 """What `preface-inspect` says of a prior, or of a head that was fitted from one."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from preface.artifacts import ArtifactError
 
@@ -35,4 +38,28 @@ def summarise_prior(path: Path, problems: list[ArtifactError]) -> dict[str, Any]
         "held_out_views": sum(len(views) for views in prior.held_out.values()),
         "validation": [f"{name} {value:.6g}" for name, value in prior.validation.items()],
         "can_resume": STATE in prior.files,
+        **({} if prior.fit is None else _summarise_fit(prior.fit)),
+    }
+
+
+def _summarise_fit(fit: Mapping[str, Any]) -> dict[str, Any]:
+    """What a head was fitted to, and how."""
+    size, loss = fit["resolution"], fit["inversion"]["loss"]
+    moved = {
+        name: f"{np.degrees(np.linalg.norm(correction['rotation'])):.2f} degrees, "
+        f"{1e3 * np.linalg.norm(correction['translation_m']):.1f} mm"
+        for name, correction in fit["cameras"].items()
+    }
+    return {
+        "head_of": fit["identity"],
+        "fitted_to": [
+            f"{view} (camera moved by {moved[view]})" if view in moved else view for view in fit["views"]
+        ],
+        "fitted_at": f"{size['width']}x{size['height']}",
+        "from": "random weights"
+        if fit["prior"] is None
+        else f"the prior with model.json {fit['prior'][:12]}...",
+        "inversion": f"{fit['inversion']['steps']} steps" + ("" if loss is None else f", loss {loss:.4g}"),
+        "finetuning": f"{fit['finetuning']['steps']} steps",
+        "quality": fit["quality"],
     }

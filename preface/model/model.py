@@ -213,18 +213,24 @@ class PriorModel(nn.Module):
     def _final(
         self, rays: Rays, tdist: Tensor, biases: Sequence[Tensor], normals: bool
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Features, raw density and, if wanted, the normals of the density, of the last round."""
+        """Features, raw density and, if wanted, the normals of the density, of the last round.
+
+        Derivatives reach rays that ask for them (cameras that are refined) through this round alone.
+        """
         head = biases[len(self.nerf.layers)]
-        if not normals:
+        moving = torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad)
+        if not normals and not moving:
             features = self.nerf.trunk(self._encode(rays, tdist), biases, self.products)
             return features, self.nerf.raw_density(features, head), None
         mean, var = coord.project_frustums(rays.origins, rays.directions, tdist, rays.radii, self.basis)
         keep = torch.is_grad_enabled()
         with torch.enable_grad():
-            mean = mean.detach().requires_grad_()
-            encoded = coord.integrated_pos_enc(mean, var.detach(), 0, self.levels).flatten(0, 1)
+            mean = mean if moving else mean.detach().requires_grad_()
+            encoded = coord.integrated_pos_enc(mean, var, 0, self.levels).flatten(0, 1)
             features = self.nerf.trunk(encoded, biases, self.products)
             raw = self.nerf.raw_density(features, head)
+            if not normals:
+                return features, raw, None
             (gradient,) = torch.autograd.grad(raw.sum(), mean, create_graph=keep)
         in_space = (gradient[..., None, :] * self.basis).sum(dim=-1)
         found = losses.normals_from_density_gradient(in_space)

@@ -26,7 +26,12 @@ _LEVELS: dict[Network, list[tuple[int, list[tuple[int, int]]]]] = {
     "alex": [(0, [(4, 2)]), (3, [(1, 2)]), (3, [(1, 1)]), (0, [(1, 1)]), (0, [(1, 1)])],
     "vgg": [(0, [(1, 1)] * 2), (2, [(1, 1)] * 2), (2, [(1, 1)] * 3), (2, [(1, 1)] * 3), (2, [(1, 1)] * 3)],
 }
-_LEAST: dict[Network, int] = {"alex": 31, "vgg": 16}  # below, a pooling has nothing left
+LEAST: dict[Network, int] = {"alex": 31, "vgg": 16}  # below, a pooling has nothing left
+# Pixels per row of features at each level; strips begin at multiples of the coarsest.
+_STRIDES: dict[Network, tuple[int, ...]] = {"alex": (4, 8, 16, 16, 16), "vgg": (1, 2, 4, 8, 16)}
+# Rows above and below a strip that its features depend on: the last level's sees 163 (alex) or 196 (vgg) rows, fewer
+# than this to either side.
+_HALO = 176
 
 
 class Lpips(nn.Module):
@@ -54,19 +59,51 @@ class Lpips(nn.Module):
         Raises:
             ValueError: shapes differ, or the images are too small for the network (31 for alex, 16 for vgg).
         """
-        least = _LEAST[self.network]
-        if image.shape != truth.shape or image.dim() != 4 or image.shape[1] != 3:
-            raise ValueError(
-                f"image: {tuple(image.shape)} and {tuple(truth.shape)} are not [n, 3, h, w] alike"
-            )
-        if min(image.shape[2:]) < least:
-            raise ValueError(f"image: {tuple(image.shape[2:])} is smaller than {least}x{least}")
+        self._require_pair(image, truth)
         ours, theirs = self._features(image), self._features(truth)
         total = image.new_zeros(len(image))
         for level, (a, b) in enumerate(zip(ours, theirs, strict=True)):
             squared = (_unit(a) - _unit(b)) ** 2
             total = total + conv2d(squared, self.get_buffer(f"linear_{level}")).mean(dim=(1, 2, 3))
         return total
+
+    @torch.no_grad()
+    def in_strips(self, image: Tensor, truth: Tensor, rows: int) -> Tensor:
+        """The same without gradients for images of any height, with the memory of a strip of them.
+
+        Args:
+            image, truth: as above.
+            rows: of a strip, a multiple of 16; features are found with 176 more above and below.
+
+        Raises:
+            ValueError: as above, or rows that are no positive multiple of 16.
+        """
+        self._require_pair(image, truth)
+        if rows < 1 or rows % 16:
+            raise ValueError(f"rows: {rows} is no positive multiple of 16")
+        height, levels = image.shape[2], range(len(_LEVELS[self.network]))
+        sums, counts = [image.new_zeros(len(image)) for _ in levels], [0 for _ in levels]
+        for top in range(0, height, rows):
+            first, last = max(0, top - _HALO), min(height, top + rows + _HALO)
+            ours, theirs = (self._features(x[:, :, first:last]) for x in (image, truth))
+            for level, (a, b) in enumerate(zip(ours, theirs, strict=True)):
+                stride = _STRIDES[self.network][level]
+                begin = (top - first) // stride
+                end = a.shape[2] if top + rows >= height else (top + rows - first) // stride
+                squared = (_unit(a[:, :, begin:end]) - _unit(b[:, :, begin:end])) ** 2
+                # A short last strip may have no row of its own at a coarse level.
+                sums[level] += (squared * self.get_buffer(f"linear_{level}")).sum(dim=(1, 2, 3))
+                counts[level] += squared.shape[2] * squared.shape[3]
+        return torch.stack([total / count for total, count in zip(sums, counts, strict=True)]).sum(dim=0)
+
+    def _require_pair(self, image: Tensor, truth: Tensor) -> None:
+        least = LEAST[self.network]
+        if image.shape != truth.shape or image.dim() != 4 or image.shape[1] != 3:
+            raise ValueError(
+                f"image: {tuple(image.shape)} and {tuple(truth.shape)} are not [n, 3, h, w] alike"
+            )
+        if min(image.shape[2:]) < least:
+            raise ValueError(f"image: {tuple(image.shape[2:])} is smaller than {least}x{least}")
 
     def _features(self, images: Tensor) -> list[Tensor]:
         """What the network sees at the end of each level, [n, c, h', w']."""

@@ -146,22 +146,22 @@ def check(config: TrainConfig) -> None:
     """
     training, run = config.training, config.run
     for name in ("steps", "identities", "views", "rays"):
-        _require(getattr(training, name) >= 1, name, getattr(training, name), "give 1 or more")
+        require(getattr(training, name) >= 1, name, getattr(training, name), "give 1 or more")
     for name in ("rate", "rate_last", "eps"):
         value = getattr(training, name)
-        _require(value > 0 and math.isfinite(value), name, value, "give a positive number")
+        require(value > 0 and math.isfinite(value), name, value, "give a positive number")
     for name in ("warmup", "holdout_views", "seed", "clip", "interlevel"):
         value = getattr(training, name)
-        _require(value >= 0 and math.isfinite(value), name, value, "give 0 or more")
+        require(value >= 0 and math.isfinite(value), name, value, "give 0 or more")
     for name in ("micro_rays", "log_every", "validate_views"):
-        _require(getattr(run, name) >= 1, name, getattr(run, name), "give 1 or more")
+        require(getattr(run, name) >= 1, name, getattr(run, name), "give 1 or more")
     for name in ("validate_every", "final_views", "faces_between", "checkpoint_minutes", "validate_minutes"):
         value = getattr(run, name)
-        _require(value >= 0 and math.isfinite(value), name, value, "give 0 or more")
-    _require(
+        require(value >= 0 and math.isfinite(value), name, value, "give 0 or more")
+    require(
         config.model.latent > 0, "model.latent", config.model.latent, "a prior needs codes; give 1 or more"
     )
-    _require(
+    require(
         config.model.background != "captured",
         "model.background",
         config.model.background,
@@ -169,6 +169,11 @@ def check(config: TrainConfig) -> None:
     )
 
 
-def _require(holds: bool, name: str, value: Any, remedy: str) -> None:
+def require(holds: bool, name: str, value: Any, remedy: str) -> None:
+    """Refuse the value of a flag that cannot work.
+
+    Raises:
+        TrainingConfigError: `holds` is false.
+    """
     if not holds:
         raise TrainingConfigError(f"--{name.replace('_', '-')} {value}: cannot be; {remedy}")

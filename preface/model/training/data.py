@@ -69,7 +69,7 @@ def open_data(dataset: Dataset, training: TrainingConfig, model: ModelConfig) ->
     if not index.valid.any():
         problem = f"no identity of '{training.split}' has a view"
         raise ArtifactError(manifest.path, "splits", problem, "Build the shards again")
-    _check_finite(dataset, index)
+    check_finite(dataset, index)
     if model.background == "black":
         _check_foreground(dataset, index)
     held = hold_out(index.valid, training.holdout_views, training.seed)
@@ -108,7 +108,12 @@ def hold_out(valid: np.ndarray, count: int, seed: int) -> np.ndarray:
     return held
 
 
-def _check_finite(dataset: Dataset, index: ViewIndex) -> None:
+def check_finite(dataset: Dataset, index: ViewIndex) -> None:
+    """Refuse cameras with numbers that are none.
+
+    Raises:
+        ArtifactError: naming the first.
+    """
     for name in ("intrinsics", "canonical_from_camera", "near_far"):
         finite = np.isfinite(dataset.tables[name]).reshape(*index.valid.shape, -1).all(axis=-1)
         wrong = np.argwhere(index.valid & ~finite)

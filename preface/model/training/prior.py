@@ -2,53 +2,41 @@
 
     ended = train_prior(TrainConfig(Path("shards"), Path("prior"), ...), say=print)
 
-The loop over steps is `_Run.go`; what a step is stands in `trainer`, what is asked of it in `prior_loss`.
+The loop over steps is `loop.take_steps`; what a step is stands in `trainer`, what is asked of it in `prior_loss`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, cast
+from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from preface.artifacts import ArtifactError, provenance, write_bytes
-from preface.model.matmul import FP32_ERROR, Route, choose_route
+from preface.artifacts import provenance
 from preface.model.model import PriorModel
 from preface.model.training.checkpoint import STATE, WEIGHTS, read_tensors, write_checkpoint
 from preface.model.training.configuration import TrainConfig, TrainingConfigError, check
 from preface.model.training.data import TrainingData, open_data, spread
+from preface.model.training.folder import carry_template, held_folder, require_same_run, show
 from preface.model.training.interruption import Interruption
-from preface.model.training.lock import only_run
 from preface.model.training.logs import RunLog
+from preface.model.training.loop import Ended, Pace, Phase, Say, take_steps
+from preface.model.training.loop import TrainingError as TrainingError  # what `train_prior` raises
 from preface.model.training.prior_files import MODEL_FILE, Prior, prior_payload, read_prior
 from preface.model.training.prior_loss import prior_terms, renderer
+from preface.model.training.products import chosen_products
 from preface.model.training.progress import Progress, duration, train_flops_per_ray
 from preface.model.training.ranks import Ranks, device_of_rank, joined_ranks
 from preface.model.training.schedule import LogLinear
-from preface.model.training.trainer import NonFiniteError, Options, Outcome, ParameterSet, Trainer
-from preface.model.training.validation import Validation, Viewer, as_png, interpolation_sheet, view_sheet
-from preface.shards import Batch, Dataset, Loader, PaperPattern
+from preface.model.training.trainer import Options, Outcome, ParameterSet, Trainer
+from preface.model.training.validation import Validation, Viewer, interpolation_sheet, view_sheet
+from preface.reports.pictures import Picture
+from preface.shards import Dataset, Loader, PaperPattern
 
 _SHARE_OF_RUN = 10  # validations of a run, unless their interval is given
-Say = Callable[[str], None]
-
-
-class TrainingError(RuntimeError):
-    """A run that cannot go on; the message says why, what is kept, and what to do."""
-
-
-@dataclass(frozen=True)
-class Ended:
-    """How a run ended: the path of model.json, and the exit status, 0 unless it was interrupted."""
-
-    path: Path
-    status: int
 
 
 def train_prior(config: TrainConfig, say: Say) -> Ended:
@@ -74,8 +62,10 @@ def train_prior(config: TrainConfig, say: Say) -> Ended:
         if config.run.dry_run:
             speak(describe(config, data))
             return Ended(config.output / MODEL_FILE, 0)
-        with _output(config.output, ranks):
+        with held_folder(config.output, ranks):
             before = _resumed(config, data)
+            if ranks.is_first:
+                carry_template(dataset.manifest.path.parent, config.output)
             if before is not None and before.finished and _was_looked_at(before):
                 speak(f"{config.output}: all {before.steps:,} steps are taken already")
                 return Ended(before.path, 0)
@@ -107,20 +97,6 @@ def describe(config: TrainConfig, data: TrainingData) -> str:
     return "\n".join(lines)
 
 
-@contextlib.contextmanager
-def _output(folder: Path, ranks: Ranks) -> Iterator[None]:
-    """Make the folder, and hold it in the process that writes."""
-    if not ranks.is_first:
-        yield
-        return
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ArtifactError.from_os(folder, "writing", error) from error
-    with only_run(folder):
-        yield
-
-
 def _resumed(config: TrainConfig, data: TrainingData) -> Prior | None:
     """The checkpoint to go on from, None to begin.
 
@@ -131,41 +107,10 @@ def _resumed(config: TrainConfig, data: TrainingData) -> Prior | None:
         return None
     prior = read_prior(config.output)
     manifest = provenance({}, {"manifest.json": data.dataset.manifest.path})["inputs"]
-    ours = {**_flat(config.to_dict()), "shards": manifest["manifest.json"]}
-    theirs = {**_flat(prior.configuration), "shards": prior.provenance["inputs"].get("manifest.json")}
-    wrong = [
-        f"{name} is {theirs.get(name)} there and {ours.get(name)} now"
-        for name in sorted(ours.keys() | theirs.keys())
-        if ours.get(name) != theirs.get(name) and name != "preset"
-    ]
-    if wrong:
-        remedy = "Give the same flags to go on, or another --output to begin anew"
-        raise ArtifactError(prior.path, "configuration", "; ".join(wrong), remedy)
+    ours = {**config.to_dict(), "shards": manifest["manifest.json"]}
+    theirs = {**prior.configuration, "shards": prior.provenance["inputs"].get("manifest.json")}
+    require_same_run(prior.path, ours, theirs)
     return prior
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in values.items():
-        flat.update(
-            _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
-        )
-    return flat
-
-
-class _Clock:
-    """Time since something was done last."""
-
-    def __init__(self) -> None:
-        self.restart()
-
-    def restart(self) -> None:
-        """It is done now."""
-        self._at = time.monotonic()
-
-    def older_than(self, minutes: float) -> bool:
-        """Whether it was done more than so many minutes ago; never for 0."""
-        return 0 < 60 * minutes < time.monotonic() - self._at
 
 
 class _Run:
@@ -181,6 +126,7 @@ class _Run:
         say: Say,
     ):
         self.config, self.data, self.ranks, self.say, self.device = config, data, ranks, say, device
+        self.output = config.output
         training = config.training
         scale, views = data.scene.scene_scale, data.dataset.manifest.views
         pattern = PaperPattern(data.train, training.seed, training.identities, training.views, training.rays)
@@ -204,7 +150,6 @@ class _Run:
             rank=ranks.rank,
             world=ranks.world,
         )
-        self.saved, self.looked = _Clock(), _Clock()
         self.viewer = Viewer(self.model, data, planes, config.run.micro_rays)
         self.prior = before or self._new_description()
         if before:
@@ -235,80 +180,52 @@ class _Run:
             files={},
         )
 
-    # ------------------------------------------------------------------------------------------ the loop
-
     def go(self) -> Ended:
         """Train until all steps are taken or a signal comes."""
-        steps, start, run = self.config.training.steps, self.prior.step, self.config.run
-        every = run.validate_every or max(steps // _SHARE_OF_RUN, 1)
+        run = self.config.run
         self.say(describe(self.config, self.data))
         with contextlib.ExitStack() as stack:
             interruption = stack.enter_context(Interruption())
-            log = stack.enter_context(RunLog(self.config.output, start)) if self.ranks.is_first else None
-            route = stack.enter_context(_products(self.prior, run.products, self.device))
+            start = self.prior.step
+            log = stack.enter_context(RunLog(self.output, start)) if self.ranks.is_first else None
+            products = chosen_products(self.prior.model, self.prior.products, run.products, self.device)
+            route = stack.enter_context(products)
             self.prior = replace(self.prior, products=route.name)
+            steps = self.config.training.steps
             progress = Progress(steps, train_flops_per_ray(self.model), 1e9 * route.gflops)
-            if start == 0:
-                self._save()
-            batches = cast(Generator[tuple[int, Batch], None, None], self.loader.batches(start, steps))
-            stack.callback(batches.close)  # ends the thread that forms them
-            progress.start()
-            for step, batch in batches:
-                outcome = self._step(step, batch)
-                progress.add(outcome)
-                done, last = step + 1, step + 1 == steps
-                self.prior = replace(self.prior, step=done)
-                if log and (done % run.log_every == 0 or last):
-                    values = progress.summary(outcome)
-                    log.write(done, "train", values)
-                    self.say(progress.line(done, values))
-                signal = self.ranks.any(interruption.signal)
-                if signal and not last:
-                    self._save()
-                    interruption.signal = signal
-                    self.say(f"interrupted after step {done:,}; the same command goes on from there")
-                    return Ended(self.prior.path, interruption.exit_status)
-                if not last and (done % every == 0 or self.looked.older_than(run.validate_minutes)):
-                    self._look(log, last=False)
-                elif self.saved.older_than(run.checkpoint_minutes):
-                    self._save()
-                progress.start()
-            self._look(log, last=True)
-        return Ended(self.prior.path, 0)
+            done = take_steps(self, self._phase(), progress, log, interruption)
+            return Ended(self.prior.path, 0 if done else interruption.exit_status)
 
-    def _look(self, log: RunLog | None, last: bool) -> None:
-        """Validate between two checkpoints: looking may take long, and be interrupted."""
-        self._save()
-        self._validate(log, self.prior.step, last)
-        self._save()
-        self.looked.restart()
+    def _phase(self) -> Phase:
+        run, steps = self.config.run, self.config.training.steps
+        every = run.validate_every or max(steps // _SHARE_OF_RUN, 1)
+        return Phase(
+            self.trainer,
+            self.loader,
+            self.prior.step,
+            steps,
+            Pace(run.log_every, every, run.validate_minutes, run.checkpoint_minutes),
+            "train into another --output with a lower --rate, a --warmup or a smaller --clip",
+            f"run again with --micro-rays {max(run.micro_rays // 2, 1)}, which changes nothing but the time, or "
+            "with a smaller model",
+        )
 
-    def _step(self, step: int, batch: Batch) -> Outcome:
-        """One step; what goes wrong says what is kept and what to do."""
-        try:
-            return self.trainer.step(step, batch)
-        except (NonFiniteError, ValueError) as error:  # ValueError: the model met a number that is none
-            words = str(error) if isinstance(error, NonFiniteError) else f"step {step}: {error}"
-            kept = f"the checkpoint in {self.config.output} is that of an earlier step"
-            remedy = "train into another --output with a lower --rate, a --warmup or a smaller --clip"
-            raise TrainingError(f"{words}; {kept}; {remedy}") from error
-        except (MemoryError, RuntimeError) as error:
-            if not is_out_of_memory(error):
-                raise
-            rays = self.config.run.micro_rays
-            raise TrainingError(
-                f"step {step}: memory ran out with {rays} rays at a time; run again with --micro-rays "
-                f"{max(rays // 2, 1)}, which changes nothing but the time, or with a smaller model"
-            ) from error
+    def taken(self, done: int, outcome: Outcome) -> None:
+        """Note how many steps are taken."""
+        self.prior = replace(self.prior, step=done)
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """Write a checkpoint."""
         if self.ranks.is_first:
             tensors: dict[str, Mapping[str, Tensor]] = {
                 WEIGHTS: self.model.state_dict(),
                 STATE: self.trainer.state(),
             }
-            write_checkpoint(self.config.output, prior_payload(self.prior), tensors)
-            self.saved.restart()
+            write_checkpoint(self.output, prior_payload(self.prior), tensors)
+
+    def look(self, log: RunLog | None, last: bool) -> None:
+        """Validate."""
+        self._validate(log, self.prior.step, last)
 
     def _validate(self, log: RunLog | None, step: int, last: bool) -> None:
         """Measure and show held-out views; at the end also the faces between the identities."""
@@ -337,43 +254,9 @@ class _Run:
             sheet = interpolation_sheet(self.viewer.interpolate(pairs), names)
             self._show(log, step, "interpolation", sheet)
 
-    def _show(self, log: RunLog, step: int, name: str, picture: Any) -> None:
-        folder = self.config.output / "validation"
-        try:
-            folder.mkdir(exist_ok=True)
-        except OSError as error:
-            raise ArtifactError.from_os(folder, "writing", error) from error
-        png = as_png(picture)
-        path = folder / (f"{name}.png" if name == "interpolation" else f"{name}-{step:08d}.png")
-        write_bytes(path, png)
-        log.picture(step, name, png, (picture.shape[1], picture.shape[0]))
-        self.say(str(path))
-
-
-@contextlib.contextmanager
-def _products(prior: Prior, wanted: str, device: torch.device) -> Iterator[Route]:
-    """Multiply by the route wanted, by that of the steps before, or by the fastest exact one."""
-    fastest = choose_route(prior.model.matmul, device, prior.model.nerf.width)
-    named = device.type == "cpu" and prior.model.matmul == "fp32"
-    name = (prior.products if wanted == "auto" else wanted) if named else ""
-    route = replace(fastest, name=name or fastest.name)
-    route.apply()
-    try:
-        if (
-            wanted == "auto" and route.name != fastest.name and not _is_exact()
-        ):  # it has moved to another machine
-            route = fastest
-            route.apply()
-        yield route
-    finally:
-        Route("mkl", 0.0, 0.0).apply()  # PyTorch's own
-
-
-def _is_exact() -> bool:
-    """Whether float32 products on the CPU are, at present."""
-    numbers = torch.linspace(-1, 1, 256 * 256).view(256, 256)
-    exact = numbers.double() @ numbers.double()
-    return float(((numbers @ numbers).double() - exact).abs().max() / exact.abs().max()) <= FP32_ERROR
+    def _show(self, log: RunLog, step: int, name: str, picture: Picture) -> None:
+        file = f"{name}.png" if name == "interpolation" else f"{name}-{step:08d}.png"
+        self.say(str(show(self.output / "validation" / file, log, step, name, picture)))
 
 
 def parameter_sets(model: PriorModel, config: TrainConfig) -> list[ParameterSet]:
@@ -385,11 +268,3 @@ def parameter_sets(model: PriorModel, config: TrainConfig) -> list[ParameterSet]
         ParameterSet(name, {names[id(p)]: p for p in parameters}, rate, training.clip or None)
         for name, parameters in model.parameter_groups().items()
     ]
-
-
-def is_out_of_memory(error: BaseException) -> bool:
-    """Whether an error says that memory ran out, of the device or of the machine."""
-    words = str(error)
-    return isinstance(error, MemoryError | torch.OutOfMemoryError) or (
-        "DefaultCPUAllocator" in words or "not enough memory" in words
-    )

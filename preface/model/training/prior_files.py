@@ -1,4 +1,4 @@
-"""A prior on the disk: ``model.json`` (schema preface/prior) beside the weights; see ``data_specs/prior.md``.
+"""A prior or a head on the disk: ``model.json`` (schema preface/prior) beside the weights; see ``data_specs/prior.md``.
 
     prior = read_prior("prior/")
     model = prior.load_model()             # preface.model.model.PriorModel
@@ -52,15 +52,16 @@ class Prior:
     Attributes:
         path: of model.json.
         model: the configuration, with its levels resolved.
-        identities: names; row i of `codes` is of identity i.
+        identities: names; row i of `codes` is of identity i. A head has one.
         scene: see there.
-        configuration: of the run, as `TrainConfig.to_dict` gives it.
+        configuration: of the run, as `TrainConfig.to_dict` or `FitConfig.to_dict` gives it.
         step, steps: taken, and of the whole run.
         held_out: views by identity that were not trained on.
         validation: the last figures on them; empty before the first.
         products: the route of matrix products (`preface.model.matmul`); empty before the first step.
         provenance: as `preface.artifacts.provenance` returns it.
         files: file, bytes and SHA-256 by role.
+        fit: of a head, what it was fitted to and how (see ``data_specs/prior.md``); None of a prior.
     """
 
     path: Path
@@ -75,6 +76,12 @@ class Prior:
     products: str
     provenance: Mapping[str, Any]
     files: Mapping[str, Any]
+    fit: Mapping[str, Any] | None = None
+
+    @property
+    def is_head(self) -> bool:
+        """Whether it is one head, fitted to views, and not a prior."""
+        return self.fit is not None
 
     @property
     def finished(self) -> bool:
@@ -117,6 +124,7 @@ def prior_payload(prior: Prior) -> dict[str, Any]:
         "products": prior.products,
         "configuration": dict(prior.configuration),
         "provenance": dict(prior.provenance),
+        **({} if prior.fit is None else {"fit": dict(prior.fit)}),
     }
 
 
@@ -155,4 +163,5 @@ def read_prior(path: str | os.PathLike[str]) -> Prior:
         products=content["products"],
         provenance=content["provenance"],
         files=content["files"],
+        fit=content.get("fit"),
     )

@@ -85,7 +85,12 @@ def interlevel(render: Render, part: Part) -> Tensor:
 
 
 def prior_terms(background: str, interlevel_weight: float) -> list[LossTerm]:
-    """The prior's objective (the paper, equation 2), and what the PSNR of training rays is computed from."""
+    """The prior's objective (the paper, equation 2), and what is measured beside it."""
+    return [*color_terms(background), LossTerm("interlevel", interlevel_weight, interlevel)]
+
+
+def color_terms(background: str) -> list[LossTerm]:
+    """The mean absolute difference of colours, and what the PSNR of rays that meet the box is computed from."""
 
     def l1(render: Render, part: Part) -> Tensor:
         return losses.l1(render.rgb, target_colors(part.batch, background))
@@ -99,7 +104,6 @@ def prior_terms(background: str, interlevel_weight: float) -> list[LossTerm]:
 
     found: list[tuple[str, float, Any]] = [
         ("l1", 1.0, l1),
-        ("interlevel", interlevel_weight, interlevel),
         ("squared_error", 0.0, squared),
         ("hit", 0.0, hit),
     ]

@@ -25,7 +25,7 @@ from preface.shards import Batch, Loader
 
 MAX_ROWS = 12  # of a sheet of views; more is no longer looked at
 STEPS_BETWEEN = 7  # faces per row of an interpolation, both ends included
-_ERROR_SHOWN = 0.25  # the mean absolute error, of 1, at the bright end of the error map
+ERROR_SHOWN = 0.25  # the mean absolute error, of 1, at the bright end of the error map
 _BEST_PSNR = 100.0  # dB, in place of infinity
 
 
@@ -161,10 +161,10 @@ def view_sheet(views: Sequence[ViewImages], box_depths: tuple[float, float]) -> 
         tiles += [
             (as_picture(view.truth), view.name),
             (as_picture(view.rgb), f"{view.psnr:.2f} dB"),
-            (colorize(error, 0, _ERROR_SHOWN, "inferno"), f"error to {_ERROR_SHOWN}"),
+            (colorize(error, 0, ERROR_SHOWN, "inferno"), f"error to {ERROR_SHOWN}"),
             (colorize(view.depth, *box_depths, "viridis"), "depth"),
         ]
-    return contact_sheet(tiles, 4, _tile_size(width, height))
+    return contact_sheet(tiles, 4, tile_size(width, height))
 
 
 def interpolation_sheet(rows: Sequence[Sequence[np.ndarray]], names: Sequence[tuple[str, str]]) -> Picture:
@@ -174,10 +174,10 @@ def interpolation_sheet(rows: Sequence[Sequence[np.ndarray]], names: Sequence[tu
     for row, (one, other) in zip(rows, names, strict=True):
         captions = [one, *[f"{share:.2f}" for share in np.linspace(0, 1, len(row))[1:-1]], other]
         tiles += [(as_picture(picture), words) for picture, words in zip(row, captions, strict=True)]
-    return contact_sheet(tiles, len(rows[0]), _tile_size(width, height))
+    return contact_sheet(tiles, len(rows[0]), tile_size(width, height))
 
 
-def _tile_size(width: int, height: int) -> tuple[int, int]:
+def tile_size(width: int, height: int) -> tuple[int, int]:
     """Whole pixels, and some 200 of them at least."""
     factor = max(1, 200 // height)
     return width * factor, height * factor

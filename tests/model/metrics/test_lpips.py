@@ -46,6 +46,26 @@ def test_a_batch_is_its_images_one_by_one(lpips):
     torch.testing.assert_close(together, alone, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("network", "height", "rows"),
+    [("vgg", 481, 160), ("alex", 475, 160), ("alex", 481, 32), ("alex", 496, 240), ("alex", 496, 512)],
+)
+def test_strips_give_what_the_whole_image_gives(network, height, rows):
+    """Tall images, so that a middle strip reaches neither end; the last strip of 481 rows is a single one."""
+    lpips, width = load_lpips(network), 33 if network == "alex" else 17
+    numbers = torch.Generator().manual_seed(height)
+    a, b = (torch.rand(1, 3, height, width, generator=numbers) for _ in range(2))
+    b[:, :, : height // 3] = a[:, :, : height // 3]  # so that a row counted twice or never shows
+    with torch.no_grad():
+        whole = lpips(a, b)
+    torch.testing.assert_close(lpips.in_strips(a, b, rows), whole, rtol=1e-5, atol=0)
+
+
+def test_strips_that_do_not_begin_where_features_do_are_refused(lpips):
+    with pytest.raises(ValueError, match="multiple of 16"):
+        lpips.in_strips(torch.zeros(1, 3, 64, 64), torch.zeros(1, 3, 64, 64), 24)
+
+
 def test_gradients_lead_from_noise_towards_the_truth(lpips):
     truth = picture("a")[:, :, 100:132, 100:132]
     image = torch.rand(truth.shape, generator=torch.Generator().manual_seed(0)).requires_grad_()

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -55,6 +56,13 @@ def test_training_brings_unseen_views_closer(balls, tmp_path):
     assert psnr(tmp_path / "a") == curve[-1] > 16
     losses = [entry["loss"] for entry in read_log(tmp_path / "a" / "log.jsonl", "train")]
     assert losses[-1] < 0.5 * losses[0]
+
+
+def test_the_template_of_the_shards_goes_with_the_prior(balls, tmp_path):
+    shards = shutil.copytree(balls, tmp_path / "shards")
+    (shards / "template.json").write_text('{"schema": "preface/template"}')
+    train_prior(config(shards, tmp_path / "a", {"steps": 1, "holdout_views": 0}), quiet)
+    assert (tmp_path / "a" / "template.json").read_bytes() == (shards / "template.json").read_bytes()
 
 
 @pytest.fixture(scope="module")

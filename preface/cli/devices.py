@@ -1,0 +1,19 @@
+"""The device that a flag names; apart from `output`, because it needs PyTorch."""
+
+import torch
+
+from preface.cli.usage import UsageError
+
+
+def usable_device(name: str) -> torch.device:
+    """A device by its name: cpu, cuda or cuda:N.
+
+    Raises:
+        UsageError: there is none of that name here.
+    """
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise UsageError(f"--device: {name} cannot be used here ({str(error).splitlines()[0]})") from error
+    return device

@@ -1,0 +1,99 @@
+"""``preface-evaluate``: heads held against photographs that they were not fitted to.
+
+This module reads the command line; `evaluate_heads` does the work and is imported when it is needed, so that
+``--help`` does not wait for PyTorch.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from preface.cli.output import exit_status, whole_number
+from preface.model.evaluation.options import FACE_HALF_SIDE, LPIPS_CHOICES
+from preface.model.rendering.shortcuts import QUALITIES
+
+_DESCRIPTION = (
+    "Render heads at views that they were not fitted to, measure PSNR, SSIM and LPIPS against the photographs, and "
+    "show both beside each other."
+)
+_EPILOG = (
+    "It writes NAME/metrics.json, sheets of pictures, tables in Markdown and LaTeX, and report.html. "
+    "Exit status: 0 when everything was written, 1 when something is wrong, 2 for wrong usage."
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit status."""
+    parser = _parser()
+    config = parser.parse_args(arguments)
+    from preface.cli.evaluate_heads import run
+
+    return exit_status(lambda: run(config), parser, parser.prog, lambda: ())
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("preface-evaluate", description=_DESCRIPTION, epilog=_EPILOG)
+    parser.add_argument("heads", type=Path, nargs="+", metavar="HEAD", help="folder of a head, or of a prior")
+    parser.add_argument("--shards", type=Path, required=True, help="with the photographs, at any resolution")
+    parser.add_argument("--output", type=Path, required=True, help="folder, made if absent")
+    what = parser.add_argument_group("of what")
+    what.add_argument(
+        "--identity", help="whose photographs (default: the identity of each head; a prior needs it)"
+    )
+    what.add_argument(
+        "--views",
+        type=_names,
+        metavar="CAMERA,...",
+        help="cameras (default: all of the identity that none of the heads has seen)",
+    )
+    how = parser.add_argument_group("how")
+    how.add_argument(
+        "--lpips",
+        choices=LPIPS_CHOICES,
+        default="both",
+        help="networks: vgg, what most papers report; alex, the default of LPIPS' authors (default: both)",
+    )
+    how.add_argument(
+        "--face-half-side",
+        type=_length,
+        default=FACE_HALF_SIDE,
+        metavar="METRES",
+        help=f"half the side of the square that is cropped about the face (default: {FACE_HALF_SIDE})",
+    )
+    how.add_argument("--images", action="store_true", help="also each view at its full size, as PNG")
+    speed = parser.add_argument_group("speed")
+    speed.add_argument(
+        "--quality",
+        choices=tuple(QUALITIES),
+        default="reference",
+        help="shortcuts of rendering (default: reference, none, so that figures are the head's and not theirs)",
+    )
+    speed.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
+    speed.add_argument(
+        "--rays-at-a-time", type=whole_number(1), default=4096, metavar="N", help="memory goes with it"
+    )
+    return parser
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """The type of a flag that takes names with commas between them."""
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a list of cameras such as cam00,cam03")
+    return names
+
+
+def _length(text: str) -> float:
+    """The type of a flag that takes metres, 1 mm to 10 m."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 1e-3 <= value <= 10:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a length from 0.001 to 10 metres")
+    return value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

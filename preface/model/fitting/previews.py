@@ -1,0 +1,123 @@
+"""Pictures of a fit under way: each view beside its render, and the head from where no photograph was taken."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from preface.geometry import Box, Camera, Rigid
+from preface.model.fitting.cameras import corrected_pose
+from preface.model.fitting.heads import Correction, code_of
+from preface.model.fitting.reduction import reduce_pixels
+from preface.model.metrics.image_quality import psnr
+from preface.model.model import PriorModel, Render
+from preface.model.rays import Rays
+from preface.model.rendering.image import RenderedImage, Space, render_image
+from preface.model.training.data import TrainingData
+from preface.model.training.validation import ERROR_SHOWN, tile_size
+from preface.reports.pictures import Picture, as_picture, colorize, contact_sheet
+
+PIXELS = 2**13  # of a picture, at most; previews are to be looked at, not measured
+AWAY = math.radians(30)  # how far the new view is turned away from the front, about the vertical axis
+_COLUMNS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Previewer:
+    """Renders previews of a head.
+
+    Attributes:
+        model: the head, on its device.
+        data: the views fitted to.
+        pairs: int64 [n, 2], identity and view, in the order of the sheet's rows.
+        correction: of their cameras, or None.
+        micro_rays: rays at a time.
+    """
+
+    model: PriorModel
+    data: TrainingData
+    pairs: np.ndarray
+    correction: Correction | None
+    micro_rays: int
+
+    def sheet(self) -> tuple[Picture, list[float]]:
+        """A row per view: photograph, render, error, depth, normals and a new view.
+
+        Returns:
+            The sheet, and the PSNR of each view on black, whole pictures, dB.
+        """
+        tiles, found = [], []
+        for person, view in self.pairs.tolist():
+            row, quality = self._row(person, view)
+            tiles += row
+            found.append(quality)
+        return contact_sheet(tiles, _COLUMNS, tile_size(*self._size())), found
+
+    def _row(self, person: int, view: int) -> tuple[list[tuple[Picture, str]], float]:
+        entry = self.data.dataset.manifest.identities[person]
+        camera, pose = self._camera(person, view)
+        truth = self._truth(person, view)
+        seen = self._render(camera, pose, normals=True)
+        new = self._render(camera, turned_away(pose), normals=False)
+        error = np.abs(seen.rgb - truth).mean(axis=-1)
+        quality = min(psnr(torch.from_numpy(seen.rgb), torch.from_numpy(truth)), 100.0)
+        depths = self.data.scene.near_far
+        assert seen.normals is not None
+        shown = np.where(np.isnan(seen.normals), 0.0, 0.5 + 0.5 * seen.normals)
+        row = [
+            (as_picture(truth), str(entry.cameras[view])),
+            (as_picture(seen.rgb), f"{quality:.2f} dB"),
+            (colorize(error, 0, ERROR_SHOWN, "inferno"), f"error to {ERROR_SHOWN}"),
+            (colorize(seen.depth, *depths, "viridis"), "depth"),
+            (as_picture(shown), "normals"),
+            (as_picture(new.rgb), "a new view"),
+        ]
+        return row, quality
+
+    def _size(self) -> tuple[int, int]:
+        """Of the pictures: the views', or smaller."""
+        width, height = self.data.scene.resolution
+        factor = min(1.0, math.sqrt(PIXELS / (width * height)))
+        return max(1, round(width * factor)), max(1, round(height * factor))
+
+    def _camera(self, person: int, view: int) -> tuple[Camera, Rigid]:
+        tables = self.data.dataset.tables
+        camera = Camera("FULL_OPENCV", *self.data.scene.resolution, tables["intrinsics"][person, view])
+        pose = tables["canonical_from_camera"][person, view]
+        placed = Rigid(pose[:, :3], pose[:, 3])
+        if self.correction is not None:
+            row = int(self.correction.rows[view])
+            names = [str(number) for number in range(len(self.pairs))]
+            placed = corrected_pose(
+                placed, self.correction.cameras.described(names, self.correction.scale)[str(row)]
+            )
+        return camera.resized(*self._size()), placed
+
+    def _truth(self, person: int, view: int) -> np.ndarray:
+        """The photograph on black, float32 [h, w, 3] in [0, 1]."""
+        pixels = self.data.dataset.pixels(person, view)
+        if self._size() != self.data.scene.resolution:
+            pixels = reduce_pixels(pixels, self._size())
+        return (pixels[..., :3].astype(np.float32) / 255) * (pixels[..., 3:].astype(np.float32) / 255)
+
+    def _render(self, camera: Camera, pose: Rigid, normals: bool) -> RenderedImage:
+        def render(rays: Rays) -> Render:
+            with torch.no_grad():
+                return self.model(rays, code_of(self.model), normals=normals)
+
+        scene = self.data.scene
+        space = Space(Box(scene.box[0], scene.box[1]), scene.scene_scale)
+        device = self.model.codes.device
+        return render_image(render, space, camera, pose, rays_at_a_time=self.micro_rays, device=device)
+
+
+def turned_away(canonical_from_camera: Rigid) -> Rigid:
+    """A pose turned about the vertical axis through the canonical origin, to the side where the camera is already."""
+    side = math.copysign(AWAY, canonical_from_camera.translation[0])
+    turn = Rotation.from_rotvec([0.0, side, 0.0]).as_matrix()
+    pose = canonical_from_camera
+    return Rigid(turn @ pose.rotation, turn @ pose.translation)

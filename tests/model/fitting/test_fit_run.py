@@ -1,0 +1,286 @@
+"""A fit as a whole: it beats starting from nothing, goes on exactly where it was, and refuses what cannot be."""
+
+import os
+import signal
+from dataclasses import replace
+
+import ball_heads
+import cv2
+import numpy as np
+import pytest
+import safetensors.torch
+import small_fits
+import torch
+from small_fits import config
+from small_runs import quiet
+
+from preface.artifacts import ArtifactError, provenance, read_artifact
+from preface.model.configuration import PRESETS
+from preface.model.fitting import run as run_module
+from preface.model.fitting.heads import head_of_prior
+from preface.model.fitting.run import fit_head
+from preface.model.training.configuration import TrainingConfigError
+from preface.model.training.lock import only_run
+from preface.model.training.logs import read_log
+from preface.model.training.loop import TrainingError
+from preface.model.training.prior_files import read_prior
+from preface.model.training.trainer import Trainer
+from preface.shards.building import build_manifest
+from preface.shards.writer import ShardWriter
+
+
+def tensors(folder):
+    return {
+        f"{name}:{key}": value
+        for name in ("model", "training_state")
+        for key, value in safetensors.torch.load_file(folder / f"{name}.safetensors").items()
+    }
+
+
+def assert_equal_bits(one, other):
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        assert value.numpy().tobytes() == other[name].numpy().tobytes(), name
+
+
+REFINED = {"refine_cameras": True}
+
+
+@pytest.fixture(scope="module")
+def straight(balls, prior, tmp_path_factory):
+    """A fit without a break, that refines its cameras too."""
+    folder = tmp_path_factory.mktemp("straight") / "head"
+    ended = fit_head(config(balls, prior, folder, **REFINED), quiet)
+    assert (ended.status, ended.path) == (0, folder / "model.json")
+    return folder
+
+
+def test_a_prior_helps_views_that_were_not_fitted_to(balls, prior, tmp_path):
+    long = {"inversion": {"steps": 15, "rate": 5e-2}, "finetuning": {"steps": 25, "rays": 128}}
+    fit_head(config(balls, prior, tmp_path / "with", **long), quiet)
+    more = {"finetuning": {"steps": 40, "rays": 128}}
+    fit_head(config(balls, "none", tmp_path / "without", **more), quiet)
+    found = [small_fits.held_out_psnr(balls, tmp_path / name) for name in ("with", "without")]
+    assert found[0] > found[1] + 3
+
+
+def test_the_baseline_may_have_the_architecture_of_a_prior(balls, prior, tmp_path):
+    """Everything but the code and what was learned; --model is then of no account."""
+    given = config(balls, "none", tmp_path / "a", model=PRESETS["small"], like=prior)
+    assert fit_head(given, quiet).status == fit_head(given, quiet).status == 0
+    head, like = read_prior(tmp_path / "a"), read_prior(prior)
+    assert head.model == replace(like.model, latent=0, predicted_normals=True)
+    assert head.fit["prior"] is None
+    refused(replace(given, like=None), r"model\.")
+
+
+def test_a_head_says_what_it_is(balls, prior, straight):
+    content = read_artifact(straight / "model.json", "preface/prior")
+    head = read_prior(straight)
+    assert head.is_head
+    assert not read_prior(prior).is_head
+    assert (head.identities, head.step, head.steps) == ((small_fits.UNSEEN,), 16, 16)
+    assert head.fit["views"] == list(small_fits.VIEWS)
+    assert head.fit["prior"] == provenance({}, {"p": prior / "model.json"})["inputs"]["p"]
+    assert head.fit["inversion"]["steps"] == head.fit["finetuning"]["steps"] == 8
+    logged = read_log(straight / "log.jsonl", "inversion")
+    assert [entry["step"] for entry in logged] == [2, 4, 6, 8]
+    assert head.fit["inversion"]["loss"] < 2 * logged[-1]["loss"]
+    assert [entry["step"] for entry in read_log(straight / "log.jsonl", "finetuning")] == [10, 12, 14, 16]
+    assert head.held_out == {small_fits.UNSEEN: ("camera0", "camera2", "camera3", "camera5")}
+    assert set(head.fit["cameras"]) == set(small_fits.VIEWS)
+    assert head.model.predicted_normals
+    assert len(head.load_model().codes) == 1
+    assert content["configuration"]["inversion"]["steps"] == 8
+
+
+def test_pictures_show_each_view_after_each_phase(straight):
+    sheets = sorted((straight / "previews").iterdir())
+    assert [sheet.name for sheet in sheets] == ["views-00000008.png", "views-00000016.png"]
+    picture = cv2.imread(str(sheets[-1]))
+    assert picture.shape[1] > 6 * ball_heads.WIDTH
+    assert picture.std() > 10
+    assert len(read_log(straight / "log.jsonl", "preview")[-1]["psnr"]) == len(small_fits.VIEWS)
+
+
+@pytest.mark.parametrize("stopped", [4, 8, 12])
+def test_a_fit_that_is_interrupted_in_either_phase_goes_on_bit_for_bit(
+    balls, prior, straight, tmp_path, stopped
+):
+    here = config(balls, prior, tmp_path / "head", **REFINED)
+    said = []
+    phase, local = ("inversion", stopped) if stopped <= 8 else ("finetuning", stopped - 8)
+
+    def say(words):
+        said.append(words)
+        if words.startswith(f"{phase}: step {local:>7,} of"):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    ended = fit_head(here, say)
+    assert ended.status == 130
+    assert "the same command goes on" in said[-1]
+    half = read_prior(tmp_path / "head")
+    assert half.step == (9 if stopped == 8 else stopped)
+    assert not half.finished
+    assert fit_head(here, quiet).status == 0
+    assert_equal_bits(tensors(tmp_path / "head"), tensors(straight))
+    assert read_prior(tmp_path / "head").fit == read_prior(straight).fit
+    for kind in ("inversion", "finetuning"):
+        ours, theirs = (
+            [entry["step"] for entry in read_log(folder / "log.jsonl", kind)]
+            for folder in (tmp_path / "head", straight)
+        )
+        assert ours == theirs
+
+
+def test_a_fit_that_is_killed_between_the_phases_goes_on_bit_for_bit(
+    balls, prior, straight, tmp_path, monkeypatch
+):
+    here = config(balls, prior, tmp_path / "head", **REFINED)
+
+    def killed(*arguments, **named):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(run_module, "finetuning_trainer", killed)
+        with pytest.raises(KeyboardInterrupt):
+            fit_head(here, quiet)
+    assert read_prior(tmp_path / "head").step == 8
+    fit_head(here, quiet)
+    assert_equal_bits(tensors(tmp_path / "head"), tensors(straight))
+
+
+def test_a_finished_fit_is_left_alone(balls, prior, straight):
+    before = (straight / "model.json").read_bytes()
+    said = []
+    assert fit_head(config(balls, prior, straight, **REFINED), said.append).status == 0
+    assert "taken already" in said[-1]
+    assert (straight / "model.json").read_bytes() == before
+
+
+def test_no_steps_at_all_are_the_prior_with_the_code_it_starts_from(balls, prior, tmp_path):
+    none = {"inversion": {"steps": 0, "start": "mean"}, "finetuning": {"steps": 0}}
+    assert fit_head(config(balls, prior, tmp_path / "a", **none), quiet).status == 0
+    head, networks = read_prior(tmp_path / "a"), read_prior(prior).load_model()
+    expected = head_of_prior(networks, networks.codes.detach().mean(dim=0)).state_dict()
+    assert head.finished
+    for name, value in head.load_model().state_dict().items():
+        assert torch.equal(value, expected[name]), name
+
+
+def test_a_frozen_code_is_the_one_that_inversion_found(balls, prior, tmp_path):
+    frozen = {"inversion": {"steps": 4}, "finetuning": {"steps": 3, "frozen_latent": True}}
+    fit_head(config(balls, prior, tmp_path / "frozen", **frozen), quiet)
+    only = {"inversion": {"steps": 4}, "finetuning": {"steps": 0}}
+    fit_head(config(balls, prior, tmp_path / "only", **only), quiet)
+    frozen_head, inverted = (read_prior(tmp_path / name).load_model() for name in ("frozen", "only"))
+    assert torch.equal(frozen_head.codes, inverted.codes)
+    assert not torch.equal(frozen_head.nerf.color.weight, inverted.nerf.color.weight)
+    assert not inverted.config.predicted_normals
+
+
+def test_finer_views_are_inverted_at_the_priors_resolution(balls, prior, tmp_path, monkeypatch):
+    """By a prior that says that its images were half as large."""
+    coarse = replace(read_prior(prior), scene=replace(read_prior(prior).scene, resolution=(12, 16)))
+    monkeypatch.setattr(run_module, "read_prior", lambda path: coarse if path == prior else read_prior(path))
+    sizes = []
+    trainer = run_module.inversion_trainer
+
+    def noted(model, inversion, data, *rest):
+        sizes.append(data.scene.resolution)
+        return trainer(model, inversion, data, *rest)
+
+    monkeypatch.setattr(run_module, "inversion_trainer", noted)
+    steps = {"inversion": {"steps": 2, "patch": 8}, "finetuning": {"steps": 1}}
+    fit_head(config(balls, prior, tmp_path / "a", **steps), quiet)
+    assert sizes == [(12, 16)]
+    assert read_prior(tmp_path / "a").scene.resolution == (ball_heads.WIDTH, ball_heads.HEIGHT)
+    assert (tmp_path / "a" / "inversion_views" / "manifest.json").exists()
+
+
+# ------------------------------------------------------------------------------------------- bad input
+
+
+def refused(here, words, kind=ArtifactError):
+    with pytest.raises(kind, match=words):
+        fit_head(here, quiet)
+
+
+def test_a_folder_of_another_fit_or_of_a_prior_is_refused(balls, prior, straight):
+    refused(
+        config(balls, prior, straight, views=("camera0",), **REFINED), r"views is \['camera1', 'camera4'\]"
+    )
+    refused(config(balls, "none", straight, **REFINED), r"inputs\.prior is \w+ there and None now.*inversion")
+    refused(config(balls, prior, straight, {"steps": 9}, **REFINED), r"inversion\.steps is 8 there and 9 now")
+    refused(config(balls, prior, prior), "would overwrite.*another --output")
+
+
+def test_a_head_is_no_prior(balls, straight, tmp_path):
+    refused(config(balls, straight, tmp_path / "a"), "is that of a head")
+
+
+def test_a_prior_that_is_not_finished_is_used_with_a_warning(balls, prior, tmp_path, monkeypatch):
+    half = replace(read_prior(prior), step=3)
+    monkeypatch.setattr(run_module, "read_prior", lambda path: half if path == prior else read_prior(path))
+    said = []
+    steps = {"inversion": {"steps": 0}, "finetuning": {"steps": 0}}
+    assert fit_head(config(balls, prior, tmp_path / "a", **steps), said.append).status == 0
+    assert "3 of 100 steps only" in said[0]
+
+
+def test_shards_of_another_box_are_refused_before_anything_is_written(prior, tmp_path):
+    (tmp_path / "shards").mkdir()
+    size = (ball_heads.WIDTH, ball_heads.HEIGHT)
+    with ShardWriter(tmp_path / "shards", 0, size, "raster", "other") as shard:
+        shard.add(replace(ball_heads.head(3), box=ball_heads.BOX * 1.2))
+    build_manifest(tmp_path / "shards", 1, {"all": ["id0003"]}, {}, provenance({}, {}))
+    refused(config(tmp_path / "shards", prior, tmp_path / "a"), "Build the shards with --box")
+    assert not (tmp_path / "a").exists()
+
+
+def test_flags_that_cannot_work_are_refused_before_anything_is_read(tmp_path):
+    here = config(tmp_path / "nothing", tmp_path / "nothing", tmp_path / "a", finetuning={"rays": 0})
+    refused(here, "--finetuning.rays 0", TrainingConfigError)
+
+
+def test_an_output_that_cannot_be_written_is_refused(balls, prior, tmp_path):
+    (tmp_path / "a").write_text("")
+    refused(config(balls, prior, tmp_path / "a"), "writing")
+
+
+def test_two_fits_into_one_folder_are_refused(balls, prior, tmp_path):
+    with only_run(tmp_path):
+        refused(config(balls, prior, tmp_path), "is training into this folder")
+
+
+def test_what_is_not_finite_keeps_the_last_checkpoint(balls, prior, tmp_path, monkeypatch):
+    step = Trainer.step
+
+    def poisoned(self, number, batch):
+        if number == 5 and len(self.sets) > 1:
+            batch = replace(batch, rgba=batch.rgba * torch.nan)
+        return step(self, number, batch)
+
+    monkeypatch.setattr(Trainer, "step", poisoned)
+    refused(
+        config(balls, prior, tmp_path / "a"),
+        r"finetuning: step 5: loss is not finite: l1.*lower --finetuning\.rate",
+        TrainingError,
+    )
+    kept = read_prior(tmp_path / "a")
+    assert kept.step == 8
+    assert all(np.isfinite(p.detach().numpy()).all() for p in kept.load_model().parameters())
+
+
+def test_memory_that_runs_out_says_what_to_lower(balls, prior, tmp_path, monkeypatch):
+    def out_of_memory(self, number, batch):
+        raise MemoryError
+
+    monkeypatch.setattr(Trainer, "step", out_of_memory)
+    refused(
+        config(balls, prior, tmp_path / "a"),
+        r"inversion: step 0: memory.*--inversion\.patches 1",
+        TrainingError,
+    )
+    none = config(balls, "none", tmp_path / "b")
+    refused(none, r"finetuning: step 0: memory.*--micro-rays 256", TrainingError)
