@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from preface.cli.output import exit_status, size, whole_number
+from preface.cli.render_shortcuts import add_quality_flags
 
 _DESCRIPTION = "Render what a model knows of a head: colour, opacity, depth and normals."
 _EPILOG = "Exit status: 0 when everything was written, 1 when something is wrong, 2 for wrong usage."
@@ -91,6 +92,7 @@ def _parser() -> argparse.ArgumentParser:
     speed.add_argument(
         "--rays-at-a-time", type=whole_number(1), default=4096, metavar="N", help="memory goes with it"
     )
+    add_quality_flags(parser)
     return parser
 
 

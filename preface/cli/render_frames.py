@@ -3,7 +3,7 @@
 import argparse
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +17,17 @@ from preface.artifacts import ArtifactError, provenance
 from preface.capture.formats import read_rig_from
 from preface.capture.images import write_exr, write_png
 from preface.capture.rig import Rig, RigCamera, read_rig, write_rig
+from preface.cli.devices import usable_device
 from preface.cli.output import say
+from preface.cli.render_shortcuts import chosen_shortcuts
 from preface.cli.usage import UsageError
 from preface.geometry import Box, Camera, Rigid
-from preface.model.matmul import denormals_flushed, keep_freed_memory
-from preface.model.model import PriorModel, Render
-from preface.model.rays import Rays
-from preface.model.rendering.image import RenderedImage, Space, render_image
+from preface.model.matmul import choose_route, denormals_flushed, keep_freed_memory
+from preface.model.model import PriorModel
+from preface.model.rendering.image import RenderedImage, RenderRays, Space, render_image, space_of
 from preface.model.rendering.mesh import MESH_SUFFIXES, extract_mesh, model_field, voxel_side, write_mesh
 from preface.model.rendering.paths import framing_camera, on_sphere, orbit
+from preface.model.rendering.shortcuts import Shortcuts, accelerate
 from preface.model.training.prior_files import Prior, read_prior
 from preface.plain_words import suggestion
 from preface.reports.pictures import Picture, as_picture, colorize
@@ -33,6 +35,7 @@ from preface.shards.writer import box_depths
 
 CAMERAS_FILE, VIDEO_FILE = "rig.json", "orbit.webm"
 FRAMES_PER_SECOND = 24
+SECONDS_BETWEEN = 10.0  # between two lines about one image
 
 
 def run(config: argparse.Namespace) -> list[str]:
@@ -46,30 +49,35 @@ def run(config: argparse.Namespace) -> list[str]:
 
 def _rendered(config: argparse.Namespace) -> list[str]:
     prior = read_prior(config.model)
-    device = _device(config.device)
-    box = Box(prior.scene.box[0], prior.scene.box[1])
+    device, shortcuts = usable_device(config.device), chosen_shortcuts(config)
+    space = space_of(prior)
+    box = space.box
     frames = _cameras(config, prior, box)
     codes = _codes(config, prior, len(frames))
     model = prior.load_model().to(device)
-    space = Space(box, prior.scene.scene_scale)
     try:
         config.output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ArtifactError.from_os(config.output, "writing", error) from error
     meshed = _mesh(config, model, space, codes[0]) if config.mesh is not None else []
-    began, video = time.perf_counter(), _Video(config.output / VIDEO_FILE) if config.video else None
-    for number, ((name, (camera, pose)), weights) in enumerate(zip(frames.items(), codes, strict=True)):
-        code = _code(model, weights)
-        render = _renderer(
-            model, None if code is None else code[None], config.background, not config.no_normals
+    if shortcuts != Shortcuts():  # exact to rounding, but what is fastest may differ from run to run
+        choose_route(shortcuts.matmul or model.config.matmul, device, model.nerf.width).apply()
+    video, progress = _Video(config.output / VIDEO_FILE) if config.video else None, _Progress(frames)
+    renderers = _renderers(model, space, codes, shortcuts, config.background, not config.no_normals)
+    for (name, (camera, pose)), render in zip(frames.items(), renderers, strict=True):
+        image = render_image(
+            render,
+            space,
+            camera,
+            pose,
+            rays_at_a_time=config.rays_at_a_time,
+            device=device,
+            progress=progress.rows,
         )
-        image = render_image(render, space, camera, pose, rays_at_a_time=config.rays_at_a_time, device=device)
         picture = _write(config.output, name, image, box, pose, exr=not config.no_exr)
         if video is not None:
             video.add(picture)
-        passed = time.perf_counter() - began
-        left = passed / (number + 1) * (len(frames) - number - 1)
-        say(f"{number + 1} of {len(frames)} images, {passed:.0f} s, about {left:.0f} s left")
+        progress.finished(camera)
     settings = {key: str(value) for key, value in vars(config).items() if value is not None}
     cameras = {name: RigCamera.at(camera, pose.inverse) for name, (camera, pose) in frames.items()}
     history = provenance(settings, {"model.json": prior.path})
@@ -78,23 +86,49 @@ def _rendered(config: argparse.Namespace) -> list[str]:
     return [*meshed, *lines, str(written)]
 
 
-def _device(name: str) -> torch.device:
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise UsageError(f"--device: {name} cannot be used here ({str(error).splitlines()[0]})") from error
-    return device
+def _renderers(
+    model: PriorModel,
+    space: Space,
+    codes: np.ndarray,
+    shortcuts: Shortcuts,
+    background: float,
+    normals: bool,
+) -> Iterator[RenderRays]:
+    """A renderer per frame; what is prepared for a code serves all frames in a row that have it."""
+    for number, weights in enumerate(codes):
+        if number == 0 or not np.array_equal(weights, codes[number - 1]):
+            code = _code(model, weights)
+            render = accelerate(model, code, space, shortcuts, background=background, normals=normals)
+        yield render
 
 
-def _renderer(
-    model: PriorModel, code: Tensor | None, background: float, normals: bool
-) -> Callable[[Rays], Render]:
-    def render(rays: Rays) -> Render:
-        with torch.no_grad():
-            return model(rays, code, background=background, normals=normals)
+class _Progress:
+    """Says how many images are done and how long the rest may take, also within an image that takes long."""
 
-    return render
+    def __init__(self, frames: Mapping[str, tuple[Camera, Rigid]]):
+        self._total = sum(camera.width * camera.height for camera, _ in frames.values())
+        self._frames, self._images, self._pixels = list(frames.values()), 0, 0
+        self._began = self._said = time.perf_counter()
+
+    def rows(self, rows: int) -> None:
+        """Rows of the present image are done."""
+        if time.perf_counter() - self._said > SECONDS_BETWEEN:
+            camera = self._frames[self._images][0]
+            share = f"row {rows} of {camera.height}, "
+            self._say(share, self._pixels + rows * camera.width)
+
+    def finished(self, camera: Camera) -> None:
+        """An image is done, and its files are written."""
+        self._images += 1
+        self._pixels += camera.width * camera.height
+        self._say("", self._pixels)
+
+    def _say(self, within: str, pixels: int) -> None:
+        self._said = time.perf_counter()
+        passed = self._said - self._began
+        left = passed / max(pixels, 1) * (self._total - pixels)
+        done = f"{self._images} of {len(self._frames)} images, {within}"
+        say(f"{done}{passed:.0f} s, about {left:.0f} s left")
 
 
 def _code(model: PriorModel, weights: np.ndarray) -> Tensor | None:

@@ -36,10 +36,10 @@ def encode_intervals(
     mean = middle + along * offset
     decay = (along * along) * t_var
     decay.add_(across * r_var).mul_(-0.5)
-    return _waves(mean.flatten(1), decay.flatten(1), levels).T
+    return waves(mean.flatten(1), decay.flatten(1), levels).T
 
 
-def _waves(angles: Tensor, decay: Tensor, levels: int) -> Tensor:
+def waves(angles: Tensor, decay: Tensor, levels: int) -> Tensor:
     """exp(4^l decay) sin and cos of 2^l angles, [2 levels b, p] of [b, p]; the arguments are overwritten."""
     rows = angles.new_empty((2, levels, *angles.shape))
     attenuation = torch.empty_like(angles)

@@ -129,6 +129,33 @@ def test_a_mesh_lies_where_the_model_is_dense_enough_and_an_empty_model_has_none
     assert len(mesh.triangles) > 50
 
 
+def test_qualities_and_single_shortcuts_stay_near_the_reference(prior, tmp_path):
+    who = ["--identity", names(prior)[0], "--size", "20x30", "--no-normals", "--no-exr", "--background", "1"]
+    pictures = {}
+    for label, flags in {
+        "reference": ["--quality", "reference"],
+        "balanced": [],
+        "draft": ["--quality", "draft"],
+        "folded": ["--quality", "reference", "--folded"],
+        "fp32": ["--quality", "balanced", "--matmul", "fp32", "--no-opaque-normals"],
+    }.items():
+        assert main([str(prior), *who, *flags, "--output", str(tmp_path / label)]) == 0
+        pictures[label] = read_image(tmp_path / label / "front.png").astype(int)
+    for label, picture in pictures.items():
+        # A prior after 20 steps is fog, of which the bounds may drop a little everywhere.
+        assert np.abs(picture - pictures["reference"]).mean() < (0.1 if label == "folded" else 4)
+
+
+def test_an_image_that_takes_long_says_how_far_it_is(prior, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("preface.cli.render_frames.SECONDS_BETWEEN", -1.0)
+    who = ["--identity", names(prior)[0], "--size", "10x12", "--no-normals", "--no-exr"]
+    assert main([str(prior), *who, "--rays-at-a-time", "50", "--output", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr().err
+    assert "row 5 of 12" in told
+    assert "s left" in told
+    assert "1 of 1 images" in told
+
+
 @pytest.mark.parametrize(
     ("arguments", "status", "words"),
     [
@@ -140,6 +167,8 @@ def test_a_mesh_lies_where_the_model_is_dense_enough_and_an_empty_model_has_none
         (["--identity", "FIRST", "--alignment", "a.json"], 2, "--cameras"),
         (["--identity", "FIRST", "--device", "cuda:77"], 2, "--device"),
         (["--identity", "FIRST", "--mesh", "head.xyz"], 2, ".ply"),
+        (["--identity", "FIRST", "--sample-share", "0"], 2, "--sample-share: 0.0"),
+        (["--identity", "FIRST", "--quality", "best"], 2, "invalid choice"),
     ],
 )
 def test_what_cannot_be_is_told_before_anything_is_written(prior, tmp_path, arguments, status, words, capsys):

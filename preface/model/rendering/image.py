@@ -16,6 +16,7 @@ from torch import Tensor
 from preface.geometry import Box, Camera, GeometryError, Rigid, Views, cast_rays
 from preface.model.model import Render
 from preface.model.rays import Rays
+from preface.model.training.prior_files import Prior
 
 SEEN = 0.5  # opacity from which a pixel has a depth and a normal
 STRIP_RAYS = 65_536  # rays whose geometry is held at a time
@@ -30,10 +31,20 @@ class Space:
     Attributes:
         box: of the canonical frame, metres.
         scale: 1/metre; the model's lengths are metres times this.
+        planes: near and far depths in metres between which all rays are sampled, of a model that is not clipped
+            to the box; None where the box's faces are the ends.
     """
 
     box: Box
     scale: float
+    planes: tuple[float, float] | None = None
+
+
+def space_of(prior: Prior) -> Space:
+    """Where a prior or a head lives."""
+    scene = prior.scene
+    planes = None if prior.model.clip_to_box else scene.near_far
+    return Space(Box(scene.box[0], scene.box[1]), scene.scene_scale, planes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +146,11 @@ def _strip_rays(view: Views, space: Space, width: int, top: int, bottom: int) ->
             f"camera: its lens folds inside the image, so that pixel ({first[0]}, {first[1]}) has no ray; "
             "use a camera without distortion, or crop the image"
         )
-    near, far, hit = space.box.intersect(cast.origins, cast.directions)
+    if space.planes is None:
+        near, far, hit = space.box.intersect(cast.origins, cast.directions)
+    else:  # the depth of directions is one
+        near, far = (np.full(len(cast.origins), depth) for depth in space.planes)
+        hit = np.ones(len(cast.origins), bool)
     arrays = {
         "origins": cast.origins * space.scale,
         "directions": cast.directions,

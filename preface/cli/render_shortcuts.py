@@ -1,0 +1,64 @@
+"""``--quality`` and a flag for each shortcut of rendering, for the commands that render."""
+
+import argparse
+import ast
+import dataclasses
+import inspect
+from typing import Any
+
+from preface.cli.usage import UsageError
+from preface.model.rendering.shortcuts import DEFAULT_QUALITY, QUALITIES, Shortcuts
+
+
+def add_quality_flags(parser: argparse.ArgumentParser) -> None:
+    """Add ``--quality`` and, for each field of `Shortcuts`, a flag of its name that replaces the quality's value."""
+    group = parser.add_argument_group(
+        "speed for accuracy",
+        "measured by tools/measure_tradeoff.py; each flag replaces what --quality chooses",
+    )
+    group.add_argument(
+        "--quality",
+        choices=list(QUALITIES),
+        default=DEFAULT_QUALITY,
+        help="reference: everything evaluated as trained; balanced: at least 45 dB to that; draft: to look at "
+        "(default: %(default)s)",
+    )
+    helps = _field_helps(Shortcuts)
+    for field in dataclasses.fields(Shortcuts):
+        name, words = f"--{field.name.replace('_', '-')}", helps[field.name]
+        if isinstance(field.default, bool):
+            group.add_argument(name, action=argparse.BooleanOptionalAction, default=None, help=words)
+        elif isinstance(field.default, str):
+            group.add_argument(name, choices=["fp32", "bf16"], default=None, help=words)
+        else:
+            kind = type(field.default)
+            group.add_argument(name, type=kind, default=None, metavar=kind.__name__.upper()[0], help=words)
+
+
+def chosen_shortcuts(config: argparse.Namespace) -> Shortcuts:
+    """What the flags of `add_quality_flags` ask for.
+
+    Raises:
+        UsageError: a value that cannot be.
+    """
+    given: dict[str, Any] = {
+        field.name: getattr(config, field.name) for field in dataclasses.fields(Shortcuts)
+    }
+    given = {name: value for name, value in given.items() if value is not None}
+    try:
+        return dataclasses.replace(QUALITIES[config.quality], **given)
+    except ValueError as error:
+        raise UsageError(f"--{str(error).replace('_', '-', 1)}") from error
+
+
+def _field_helps(kind: type) -> dict[str, str]:
+    """The text under each field of a dataclass, in one line."""
+    (body,) = ast.parse(inspect.getsource(kind)).body
+    assert isinstance(body, ast.ClassDef)
+    helps = {}
+    for field, text in zip(body.body, body.body[1:], strict=False):
+        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+            assert isinstance(field.target, ast.Name)
+            assert isinstance(text.value, ast.Constant)
+            helps[field.target.id] = " ".join(str(text.value.value).split()).replace("%", "%%")
+    return helps

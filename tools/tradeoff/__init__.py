@@ -1,0 +1,1 @@
+"""What ``tools/measure_tradeoff.py`` is made of: points to measure, measuring, choosing among them, telling."""
