@@ -34,13 +34,18 @@ def blocks(studio, kind):
 
 
 def test_the_page_counts_what_the_capture_holds(studio, capsys):
-    assert show_studio.main([str(studio), "--took", "studio", "12.5"]) == 0
+    assert show_studio.main([str(studio)]) == 0
     assert capsys.readouterr().out.strip() == str(studio / "report.html")
     counts = {f["name"]: f["value"] for f in blocks(studio, "key_figures")[0]["figures"]}
     expected = {"people": 3, "cameras": 3, "takes": 2, "photographs": 9, "calibration images": 18}
     assert expected.items() <= counts.items()
-    assert blocks(studio, "table")[0]["rows"] == [{"stage": "studio", "time": 12.5}]
     assert len(blocks(studio, "picture")) == 3
+
+
+def test_the_page_may_have_another_name(studio, capsys):
+    assert show_studio.main([str(studio), "--page", "studio.html"]) == 0
+    assert capsys.readouterr().out.strip() == str(studio / "studio.html")
+    assert not (studio / "report.html").exists()
 
 
 def test_the_cameras_of_the_page_are_the_true_ones(studio):
