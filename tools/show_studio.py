@@ -7,9 +7,9 @@ is read as any capture, and the rest from ``DIR/truth`` (see ``tools/synthetic_s
 
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -52,10 +52,8 @@ class ShowStudio:
     frames: int = 4
     """How many calibration frames of the first take to show."""
 
-    took: Annotated[dict[str, float], tyro.conf.arg(metavar="STAGE SECONDS ...")] = field(
-        default_factory=dict
-    )
-    """Names of earlier stages and the seconds that each took, to be listed on the page."""
+    page: str = "report.html"
+    """Name of the page within the folder."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +104,7 @@ def main(arguments: list[str] | None = None) -> int:
     config = tyro.cli(ShowStudio, args=arguments)
     try:
         studio = Studio(config.studio, read_capture(config.studio / "capture"))
-        page = build_report(studio, config).write(config.studio / "report.html")
+        page = build_report(studio, config).write(config.studio / config.page)
     except ArtifactError as error:
         print(f"show_studio: {error}", file=sys.stderr)
         return 1
@@ -123,7 +121,7 @@ def build_report(studio: Studio, config: ShowStudio) -> Report:
     }
     origin = provenance({"people": config.people, "frames": config.frames}, inputs)
     report = Report("Synthetic studio", {**origin, "capture": dict(manifest.provenance or {})})
-    _show_overview(report.section("Overview"), studio, config)
+    _show_overview(report.section("Overview"), studio)
     people = manifest.subjects[: config.people]
     if people:
         _show_people(report.section("People"), studio, people)
@@ -133,7 +131,7 @@ def build_report(studio: Studio, config: ShowStudio) -> Report:
     return report
 
 
-def _show_overview(section: Section, studio: Studio, config: ShowStudio) -> None:
+def _show_overview(section: Section, studio: Studio) -> None:
     capture, manifest = studio.capture, studio.capture.manifest
     calibration = sum(
         len(capture.calibration_files(t, c.id)) for t in manifest.takes for c in manifest.cameras
@@ -149,13 +147,6 @@ def _show_overview(section: Section, studio: Studio, config: ShowStudio) -> None
             KeyFigure("size", ", ".join(sizes), "px"),
         ]
     )
-    if config.took:
-        stages = [{"stage": name, "time": seconds} for name, seconds in config.took.items()]
-        section.table(
-            stages,
-            "Time of each stage in this run; a resumed stage does only what is left",
-            units={"time": "s"},
-        )
 
 
 def _show_people(section: Section, studio: Studio, people: tuple[Subject, ...]) -> None:

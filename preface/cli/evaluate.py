@@ -43,8 +43,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     what.add_argument(
         "--views",
-        type=_names,
-        metavar="CAMERA,...",
+        nargs="+",
+        metavar="CAMERA",
         help="cameras (default: all of the identity that none of the heads has seen)",
     )
     how = parser.add_argument_group("how")
@@ -74,14 +74,6 @@ def _parser() -> argparse.ArgumentParser:
         "--rays-at-a-time", type=whole_number(1), default=4096, metavar="N", help="memory goes with it"
     )
     return parser
-
-
-def _names(text: str) -> tuple[str, ...]:
-    """The type of a flag that takes names with commas between them."""
-    names = tuple(name.strip() for name in text.split(","))
-    if not all(names):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a list of cameras such as cam00,cam03")
-    return names
 
 
 def _length(text: str) -> float:

@@ -84,7 +84,7 @@ def main() -> None:
     parser.add_argument("--shards", type=Path, required=True)
     parser.add_argument("--studio", type=Path, required=True, help="folder with capture/ and truth/")
     parser.add_argument("--identity")
-    parser.add_argument("--views", type=lambda text: tuple(text.split(",")), metavar="CAMERA,...")
+    parser.add_argument("--views", nargs="+", metavar="CAMERA")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--rays-at-a-time", type=int, default=4096)

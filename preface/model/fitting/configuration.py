@@ -43,6 +43,8 @@ class InversionConfig:
     """Weight of LPIPS beside the absolute difference; 0 does without. The paper: 0.2."""
     network: Literal["vgg", "alex"] = "vgg"
     """The network of LPIPS. The paper does not say."""
+    camera_share: float = 1 / 3
+    """With --refine-cameras: the last share of the steps, in which the cameras are refined, too. Not in the paper."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class FinetuningConfig:
     """Weight of the squared norm of the weights that see the direction; 0 does without. The paper: 0.0001."""
     frozen_latent: bool = False
     """Keep the code that inversion found, and adapt the networks only."""
-    camera_rate: float = 1e-3
+    camera_rate: float = 5e-4
     """Learning rate of refined cameras, radians and scene units; it falls as the other does."""
     camera_weight: float = 3e-5
     """Weight of the pull of refined cameras to where they were. See `CameraCorrections.penalty`: this counts as
@@ -122,7 +124,7 @@ class FitConfig:
     """Which defaults all flags below have: for a minute and a half or for six on two processor cores with a small
     prior, or the paper's."""
     refine_cameras: bool = False
-    """Find small corrections of the cameras, too, while finetuning."""
+    """Find small corrections of the cameras, too, in the last of inversion and while finetuning."""
     seed: int = 0
     """Everything random follows from this number."""
     inversion: InversionConfig = field(default_factory=InversionConfig)
@@ -219,6 +221,7 @@ def check(config: FitConfig) -> None:
     least = LEAST_PATCH[inversion.network] if inversion.lpips > 0 else 1
     _check_numbers("inversion.", inversion, {"steps": 0, "patches": 1, "patch": least, "lpips": 0})
     _check_rates("inversion.", inversion, ("rate",))
+    _check_share("inversion.camera-share", inversion.camera_share)
     numbers: dict[str, float] = {
         "rays": 1,
         "clip": 0,
@@ -231,8 +234,7 @@ def check(config: FitConfig) -> None:
         numbers["steps"] = 0
     _check_numbers("finetuning.", finetuning, numbers)
     _check_rates("finetuning.", finetuning, ("rate", "rate_last", "eps", "camera_rate"))
-    share = finetuning.foreground_share
-    require(0 <= share <= 1, "finetuning.foreground-share", share, "give a share, 0 to 1")
+    _check_share("finetuning.foreground-share", finetuning.foreground_share)
     limits = {"micro_rays": 1, "log_every": 1, "checkpoint_minutes": 0, "preview_every": 0}
     _check_numbers("", run, limits)
 
@@ -251,6 +253,10 @@ def _check_numbers(prefix: str, values: Any, limits: Mapping[str, float]) -> Non
     for name, least in limits.items():
         value = getattr(values, name)
         require(value >= least and math.isfinite(value), prefix + name, value, f"give {least:g} or more")
+
+
+def _check_share(name: str, share: float) -> None:
+    require(0 <= share <= 1, name, share, "give a share, 0 to 1")
 
 
 def _check_rates(prefix: str, values: Any, names: tuple[str, ...]) -> None:

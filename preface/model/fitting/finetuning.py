@@ -11,7 +11,7 @@ from torch import Tensor
 
 from preface.model import losses
 from preface.model.fitting.configuration import FinetuningConfig
-from preface.model.fitting.heads import Correction, head_renderer
+from preface.model.fitting.heads import Correction, camera_set, camera_term, head_renderer
 from preface.model.fitting.observations import view_loader
 from preface.model.model import PriorModel, Render
 from preface.model.training.data import TrainingData
@@ -78,11 +78,8 @@ def parameter_sets(
         if not (name == "codes" and frozen)
     ]
     if correction is not None:
-        moved = {f"cameras.{name}": p for name, p in correction.cameras.named_parameters()}
-        slow = LogLinear(
-            config.camera_rate, config.camera_rate * config.rate_last / config.rate, max(steps, 1)
-        )
-        sets.append(ParameterSet("cameras", moved, slow, None))
+        last = config.camera_rate * config.rate_last / config.rate
+        sets.append(camera_set(correction, LogLinear(config.camera_rate, last, max(steps, 1))))
     return sets
 
 
@@ -101,12 +98,7 @@ def finetuning_terms(
 
         terms.append(LossTerm("view_weights", config.view_weights, view_weights))
     if correction is not None:
-        cameras, scale = correction.cameras, correction.scale
-
-        def moved(render: Render, part: Part) -> Tensor:
-            return cameras.penalty(scale)
-
-        terms.append(LossTerm("cameras", config.camera_weight, moved))
+        terms.append(camera_term(correction, config.camera_weight))
     return terms
 
 

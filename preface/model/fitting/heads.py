@@ -18,7 +18,7 @@ from preface.model.fitting.cameras import CameraCorrections
 from preface.model.model import PriorModel, Render
 from preface.model.rays import Rays
 from preface.model.training.prior_loss import jitter
-from preface.model.training.trainer import Part
+from preface.model.training.trainer import LossTerm, ParameterSet, Part
 
 
 def head_config(model: ModelConfig) -> ModelConfig:
@@ -78,6 +78,21 @@ class Correction:
     def apply(self, rays: Rays, view: Tensor) -> Rays:
         """The corrected rays, whose views are int64 [n]."""
         return self.cameras.apply(rays, self.rows[view], self.box, self.scale)
+
+
+def camera_set(correction: Correction, rate: Callable[[int], float]) -> ParameterSet:
+    """The corrections as parameters that are not clipped."""
+    moved = {f"cameras.{name}": p for name, p in correction.cameras.named_parameters()}
+    return ParameterSet("cameras", moved, rate, None)
+
+
+def camera_term(correction: Correction, weight: float) -> LossTerm:
+    """The pull of refined cameras to where they were."""
+
+    def moved(render: Render, part: Part) -> Tensor:
+        return correction.cameras.penalty(correction.scale)
+
+    return LossTerm("cameras", weight, moved)
 
 
 def head_renderer(

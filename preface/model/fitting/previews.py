@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,9 +16,9 @@ from preface.model.fitting.cameras import corrected_pose
 from preface.model.fitting.heads import Correction, code_of
 from preface.model.fitting.reduction import reduce_pixels
 from preface.model.metrics.image_quality import psnr
-from preface.model.model import PriorModel, Render
-from preface.model.rays import Rays
+from preface.model.model import PriorModel
 from preface.model.rendering.image import RenderedImage, Space, render_image
+from preface.model.rendering.shortcuts import DEFAULT_QUALITY, QUALITIES, accelerate
 from preface.model.training.data import TrainingData
 from preface.model.training.validation import ERROR_SHOWN, tile_size
 from preface.reports.pictures import Picture, as_picture, colorize, contact_sheet
@@ -50,19 +52,29 @@ class Previewer:
         Returns:
             The sheet, and the PSNR of each view on black, whole pictures, dB.
         """
-        tiles, found = [], []
+        tiles, found, render = [], [], self._renderer()
         for person, view in self.pairs.tolist():
-            row, quality = self._row(person, view)
+            row, quality = self._row(person, view, render)
             tiles += row
             found.append(quality)
         return contact_sheet(tiles, _COLUMNS, tile_size(*self._size())), found
 
-    def _row(self, person: int, view: int) -> tuple[list[tuple[Picture, str]], float]:
+    def _renderer(self) -> Callable[[Camera, Rigid], RenderedImage]:
+        """Render the head as it is now, by shortcuts: a preview shall not take longer than the fit."""
+        scene, code = self.data.scene, code_of(self.model)
+        space = Space(Box(scene.box[0], scene.box[1]), scene.scene_scale)
+        row = None if code is None else code[0].detach()
+        rays = accelerate(self.model, row, space, QUALITIES[DEFAULT_QUALITY], normals=True)
+        how: dict[str, Any] = {"rays_at_a_time": self.micro_rays, "device": self.model.codes.device}
+        return lambda camera, pose: render_image(rays, space, camera, pose, **how)
+
+    def _row(
+        self, person: int, view: int, render: Callable[[Camera, Rigid], RenderedImage]
+    ) -> tuple[list[tuple[Picture, str]], float]:
         entry = self.data.dataset.manifest.identities[person]
         camera, pose = self._camera(person, view)
         truth = self._truth(person, view)
-        seen = self._render(camera, pose, normals=True)
-        new = self._render(camera, turned_away(pose), normals=False)
+        seen, new = render(camera, pose), render(camera, turned_away(pose))
         error = np.abs(seen.rgb - truth).mean(axis=-1)
         quality = min(psnr(torch.from_numpy(seen.rgb), torch.from_numpy(truth)), 100.0)
         depths = self.data.scene.near_far
@@ -103,16 +115,6 @@ class Previewer:
         if self._size() != self.data.scene.resolution:
             pixels = reduce_pixels(pixels, self._size())
         return (pixels[..., :3].astype(np.float32) / 255) * (pixels[..., 3:].astype(np.float32) / 255)
-
-    def _render(self, camera: Camera, pose: Rigid, normals: bool) -> RenderedImage:
-        def render(rays: Rays) -> Render:
-            with torch.no_grad():
-                return self.model(rays, code_of(self.model), normals=normals)
-
-        scene = self.data.scene
-        space = Space(Box(scene.box[0], scene.box[1]), scene.scene_scale)
-        device = self.model.codes.device
-        return render_image(render, space, camera, pose, rays_at_a_time=self.micro_rays, device=device)
 
 
 def turned_away(canonical_from_camera: Rigid) -> Rigid:

@@ -24,7 +24,7 @@ from preface.model.fitting.cameras import CameraCorrections
 from preface.model.fitting.configuration import FitConfig, check, finetuning_steps
 from preface.model.fitting.finetuning import finetuning_trainer
 from preface.model.fitting.heads import Correction, head_from_scratch, head_of_prior, with_predicted_normals
-from preface.model.fitting.inversion import inversion_trainer
+from preface.model.fitting.inversion import Refined, inversion_trainer
 from preface.model.fitting.observations import fitted_views, grids, observe
 from preface.model.fitting.previews import Previewer
 from preface.model.fitting.reduction import FOLDER, reduce_views, reduced_size
@@ -231,9 +231,16 @@ class _Fit:
             data = observe(
                 self._open.enter_context(Dataset(manifest)), data.names[0], self.config.views, self._prior
             )
-        config, run = self.config.inversion, self.config.run
+        config, run, finetuning = self.config.inversion, self.config.run, self.config.finetuning
+        refined = None
+        if self._correction is not None:
+            correction = self._correction
+            if data is not self.data:  # whose views are those fitted to, in the same order
+                rows = correction.rows[torch.from_numpy(self.data.train.pairs[:, 1]).to(self.device)]
+                correction = replace(correction, rows=rows)
+            refined = Refined(correction, finetuning.camera_rate, finetuning.camera_weight)
         trainer, loader = inversion_trainer(
-            self.model, config, data, self.config.seed, run.micro_rays, self.device
+            self.model, config, data, self.config.seed, run.micro_rays, self.device, refined
         )
         less = f"--inversion.patches {max(config.patches // 2, 1)} or a smaller --inversion.patch"
         remedy = "fit into another --output with a lower --inversion.rate"

@@ -265,7 +265,7 @@ def _changed(model: PriorModel, shortcuts: Shortcuts) -> PriorModel:
     """A copy of a folded model with products of another precision, or without its highest levels."""
     levels = min(shortcuts.levels or model.levels, model.levels)
     config = dataclasses.replace(model.config, levels=levels, matmul=shortcuts.matmul or model.config.matmul)
-    changed = PriorModel(config, 0).to(model.basis.device)
+    changed = PriorModel(config, len(model.codes)).to(model.basis.device)
     values = model.state_dict()
     directions = model.basis.shape[1]
     kept = torch.arange(2 * model.levels * directions) // directions % model.levels < levels

@@ -74,6 +74,16 @@ def test_the_baseline_may_have_the_architecture_of_a_prior(balls, prior, tmp_pat
     refused(replace(given, like=None), r"model\.")
 
 
+@pytest.mark.parametrize(("share", "moved"), [(0.0, False), (0.5, True)])
+def test_cameras_are_refined_in_the_last_share_of_inversion(balls, prior, tmp_path, share, moved):
+    choices = {"inversion": {"camera_share": share}, "finetuning": {"steps": 0}, **REFINED}
+    fit_head(config(balls, prior, tmp_path / "a", **choices), quiet)
+    cameras = read_prior(tmp_path / "a").fit["cameras"]
+    assert set(cameras) == set(small_fits.VIEWS)
+    turned = np.array([camera["rotation"] for camera in cameras.values()])
+    assert (np.abs(turned).max(axis=1) > 0).all() == np.any(turned) == moved
+
+
 def test_a_head_says_what_it_is(balls, prior, straight):
     content = read_artifact(straight / "model.json", "preface/prior")
     head = read_prior(straight)

@@ -214,3 +214,14 @@ def test_levels_that_are_left_out_change_nothing_that_they_did_not_carry(ball):
 def test_what_cannot_be_is_refused_by_its_field(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         Shortcuts(**wrong)
+
+
+@pytest.mark.parametrize("quality", list(QUALITIES))
+def test_a_head_that_never_had_a_prior_is_rendered_alike(ball, quality):
+    """It has a row of codes of no numbers (preface.model.fitting.heads.head_from_scratch)."""
+    folded = fold(ball, ball.codes[0])
+    alone = PriorModel(folded.config, 1)
+    alone.load_state_dict({**folded.state_dict(), "codes": torch.zeros(1, 0)})
+    render = accelerate(alone, None, SPACE, QUALITIES[quality])
+    image = render_image(render, SPACE, CAMERA, FRONT, rays_at_a_time=4096)
+    assert decibels(image, seen(ball, QUALITIES[quality])) > 60
