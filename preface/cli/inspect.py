@@ -94,6 +94,9 @@ def _artifacts(path: Path) -> list[Report]:
     if not path.is_dir():
         return [Report(path, "preface/shard" if path.match(_SHARDS) else None)]
     found = [Report(path / name, schema) for name, schema in _NAMES.items() if os.path.lexists(path / name)]
+    # Shards and the priors trained on them carry a copy of the alignment's template, which is not what is meant.
+    if list(path.glob(_SHARDS)) or os.path.lexists(path / "model.json"):
+        found = [report for report in found if report.schema != "preface/template"]
     if (path / "subjects").is_dir() and not os.path.lexists(path / "capture.json"):
         found.insert(0, Report(path, "preface/capture"))  # its manifest is inferred
     if not found and list(path.glob(_SHARDS)):

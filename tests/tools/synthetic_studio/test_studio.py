@@ -233,7 +233,7 @@ def test_ctrl_c_ends_cleanly_and_says_how_to_resume(tmp_path):
         )
     )
     output = tmp_path / "out"
-    flags = ["--identities=3", "--views=3", "--resolution=64x96", "--board.frames=400", "--jobs=2"]
+    flags = ["--identities=3", "--views=3", "--resolution=64x96", "--board.frames=2000", "--jobs=2"]
     process = subprocess.Popen(
         [sys.executable, script, f"--output={output}", *flags],
         stdout=subprocess.PIPE,
@@ -241,7 +241,7 @@ def test_ctrl_c_ends_cleanly_and_says_how_to_resume(tmp_path):
         text=True,
         start_new_session=True,
     )
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300
     while not list(output.rglob("frame*.png")) and time.monotonic() < deadline:
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: parent and workers alike
