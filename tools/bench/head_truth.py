@@ -39,9 +39,7 @@ from preface.model.evaluation.views import (
     require_same_space,
     standing_camera,
 )
-from preface.model.model import Render
-from preface.model.rays import Rays
-from preface.model.rendering.image import RenderedImage, RenderRays, render_image, space_of
+from preface.model.rendering.image import RenderedImage, render_image, space_of
 from preface.model.rendering.shortcuts import Shortcuts
 from preface.model.training.prior_files import Prior, read_prior
 from preface.shards import Dataset
@@ -124,10 +122,10 @@ def head_errors(
     layout, place = Layout(config.studio), canonical_from_studio(dataset, identity, config.studio)
     model = prior.load_model().to(config.device)
     space = space_of(prior)
-    render = head_renderer(model, prior.identities.index(identity), space, Shortcuts())
-    kinds = {"density": _density_normals(render)}
+    row = prior.identities.index(identity)
+    kinds = {"density": head_renderer(model, row, space, Shortcuts())}
     if model.config.predicted_normals:
-        kinds["predicted"] = render
+        kinds["predicted"] = head_renderer(model, row, space, Shortcuts(predicted_normals=True))
     found = {}
     for name in views:
         standing = standing_camera(dataset, identity, name)
@@ -146,15 +144,6 @@ def head_errors(
         found[name] = figures
         print(f"{prior.path.parent.name}, {identity}/{name}: {figures}", file=sys.stderr, flush=True)
     return found
-
-
-def _density_normals(render: RenderRays) -> RenderRays:
-    """The same, but for the predicted normals, in whose place those of the density are shown."""
-
-    def without_predicted(rays: Rays) -> Render:
-        return dataclasses.replace(render(rays), normals_pred=None)
-
-    return without_predicted
 
 
 def canonical_from_studio(dataset: Dataset, identity: str, studio: Path) -> Similarity:

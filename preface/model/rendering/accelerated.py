@@ -53,7 +53,7 @@ def accelerated(
     if shortcuts.changes_model:
         model = _changed(model, shortcuts)
     if not shortcuts.skips:
-        return _whole(model, code, background, normals)
+        return _whole(model, code, background, normals, shortcuts.predicted_normals)
     grid = None
     if shortcuts.occupancy:
         side = float((space.box.maximum - space.box.minimum).max()) * space.scale / shortcuts.occupancy
@@ -62,10 +62,14 @@ def accelerated(
     return ShortRenderer(model, grid, shortcuts, space.scale, background, normals)
 
 
-def _whole(model: PriorModel, code: Tensor | None, background: float, normals: bool) -> RenderRays:
+def _whole(
+    model: PriorModel, code: Tensor | None, background: float, normals: bool, predicted: bool
+) -> RenderRays:
     def render(rays: Rays) -> Render:
         with torch.no_grad():
-            return model(rays, None if code is None else code[None], background=background, normals=normals)
+            seen = model(rays, None if code is None else code[None], background=background, normals=normals)
+        instead = predicted and seen.normals_pred is not None
+        return dataclasses.replace(seen, normals=None) if instead else seen
 
     return render
 
@@ -80,7 +84,7 @@ class ShortRenderer:
         shortcuts: which.
         scale: scene units per metre.
         background: grey value behind the head.
-        normals: whether to find them: predicted ones where the model has them, the density's where not.
+        normals: whether to find them.
     """
 
     model: PriorModel
@@ -247,7 +251,7 @@ class ShortRenderer:
             shown = opaque & (weights > self.shortcuts.color_bound)
             wanted = _rounded(shown.view(-1)[chosen].nonzero()[:, 0])
             chosen, features = chosen[wanted], features[wanted]
-        if nerf.normals is not None:
+        if self.shortcuts.predicted_normals and nerf.normals is not None:
             raw = nerf.raw_normals(features, biases[len(nerf.layers) + 2])
             return None, _spread(losses.normals_from_density_gradient(raw), chosen, weights.shape)
         mean, variance = (x.T.contiguous() for x in sample_gaussians(rays, tdist, chosen, model.basis))

@@ -165,8 +165,8 @@ def _strip_rays(view: Views, space: Space, width: int, top: int, bottom: int) ->
 
 
 def _normals(seen: Render, opaque: Tensor) -> Tensor | None:
-    """The mean normal of a ray, at length one: the predicted ones where there are such."""
-    along = seen.normals if seen.normals_pred is None else seen.normals_pred
+    """The mean normal of a ray, at length one: the density's, or the predicted where there are no others."""
+    along = seen.normals_pred if seen.normals is None else seen.normals
     if along is None:
         return None
     mean = (seen.levels[-1].weights[..., None] * along).sum(dim=-2)

@@ -61,6 +61,10 @@ class Shortcuts:
     dB to the fullest render."""
     opaque_normals: bool = False
     """Find normals only of rays that show one, those of which half the light stops; no other ray's are shown."""
+    predicted_normals: bool = False
+    """Show the normals that a head predicts, where it does, in place of the density's: smooth, and without
+    derivatives. Of three heads of a `small` prior after 200 steps of finetuning they were off by 38 to 41 degrees
+    (median over views not fitted to), the density's by 21 to 26 (`tools/bench/head_truth.py`)."""
     matmul: Literal["", "fp32", "bf16"] = ""
     """Precision of products inside the networks; by default as trained. bf16: 0.71 of the time on a processor that
     has such products, 68 dB to the render without."""
@@ -145,7 +149,7 @@ def accelerate(
 
     Returns:
         Rays to what they see, as `render_image` takes it. With shortcuts that skip, `Render.levels` has the last
-        round alone, of the rays in `Render.evaluated`, and normals of either kind, the predicted where there are.
+        round alone, of the rays in `Render.evaluated`, and normals of one kind.
 
     Raises:
         ValueError: a code of another length, or a model with codes and none given.

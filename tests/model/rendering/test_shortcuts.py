@@ -162,17 +162,29 @@ def test_one_pixel_and_rays_that_only_graze_the_box(ball):
     assert np.abs(grazing.alpha - full.alpha).mean() < 0.02
 
 
-@pytest.mark.parametrize("predicted", [False, True])
-def test_normals_of_opaque_rays_are_those_of_the_full_evaluation(predicted):
-    model = ball_model(normals=predicted)
-    full = seen(model, Shortcuts(), normals=True)
-    ours = seen(model, dataclasses.replace(GRID, opaque_normals=True, color_bound=1e-3), normals=True)
+@pytest.mark.parametrize(("head", "predicted"), [(False, False), (True, False), (True, True)])
+def test_normals_of_opaque_rays_are_those_of_the_full_evaluation(head, predicted):
+    model = ball_model(normals=head)
+    full = seen(model, Shortcuts(predicted_normals=predicted), normals=True)
+    few = dataclasses.replace(GRID, opaque_normals=True, color_bound=1e-3, predicted_normals=predicted)
+    ours = seen(model, few, normals=True)
     assert full.normals is not None
     assert ours.normals is not None
     both = np.isfinite(full.normals[..., 0]) & np.isfinite(ours.normals[..., 0])
     assert both.mean() > 0.1
     assert (np.isfinite(ours.normals[..., 0]) == (ours.alpha > 0.5)).mean() > 0.999
     assert np.median((full.normals * ours.normals).sum(-1)[both]) > 0.98
+
+
+@pytest.mark.parametrize("few", [Shortcuts(), GRID])
+def test_the_density_s_normals_are_shown_unless_predicted_ones_are_asked_for(few):
+    """The ball's point outwards; the layer that predicts others was never trained."""
+    model = ball_model(normals=True)
+    ours = seen(model, few, normals=True).normals
+    other = seen(model, dataclasses.replace(few, predicted_normals=True), normals=True).normals
+    towards = FRONT.translation / np.linalg.norm(FRONT.translation)
+    assert np.nanmean(ours @ towards) > 0.5
+    assert np.nanmean((ours * other).sum(-1)) < 0.5
 
 
 def test_each_code_has_its_own_grid(ball):
