@@ -69,6 +69,9 @@ class FinetuningConfig:
     """Adam's epsilon, see ``preface-train``."""
     interlevel: float = 1.0
     """Weight of the loss that teaches the proposal network. The paper: 1."""
+    opacity: float = 0.0
+    """Weight of the mean absolute difference between opacity and mask, on black; 0 for none. Colours alone cannot tell
+    black hair from a black background. The paper: none."""
     normals: float = 1e-3
     """Weight of the disagreement between predicted and analytic normals; 0 does without the head that predicts
     them. The paper: 0.001."""
@@ -226,6 +229,7 @@ def check(config: FitConfig) -> None:
         "rays": 1,
         "clip": 0,
         "interlevel": 0,
+        "opacity": 0,
         "normals": 0,
         "view_weights": 0,
         "camera_weight": 0,

@@ -15,7 +15,7 @@ from preface.model.fitting.heads import Correction, camera_set, camera_term, hea
 from preface.model.fitting.observations import view_loader
 from preface.model.model import PriorModel, Render
 from preface.model.training.data import TrainingData
-from preface.model.training.prior_loss import color_terms, interlevel
+from preface.model.training.prior_loss import color_terms, interlevel, opacity
 from preface.model.training.schedule import LogLinear
 from preface.model.training.trainer import LossTerm, Options, ParameterSet, Part, Trainer
 from preface.shards import Loader, SingleRays
@@ -86,8 +86,10 @@ def parameter_sets(
 def finetuning_terms(
     model: PriorModel, config: FinetuningConfig, correction: Correction | None
 ) -> list[LossTerm]:
-    """The paper's objective, equation 3, and the pull of refined cameras to where they were."""
+    """The paper's objective, equation 3; if asked for, opacity; and the pull of refined cameras to their places."""
     terms = [*color_terms("black"), LossTerm("interlevel", config.interlevel, interlevel)]
+    if config.opacity > 0:
+        terms.append(LossTerm("opacity", config.opacity, opacity))
     if config.normals > 0:
         terms.append(LossTerm("normals", config.normals, predicted_normals))
     if config.view_weights > 0:

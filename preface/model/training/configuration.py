@@ -45,6 +45,9 @@ class TrainingConfig:
     1e-8 by 0.97."""
     interlevel: float = 1.0
     """Weight of the loss that teaches the proposal network. Mip-NeRF 360 and the paper: 1."""
+    opacity: float = 0.0
+    """Weight of the mean absolute difference between opacity and mask, on black; 0 for none. Colours alone cannot tell
+    black hair from a black background. The paper: none."""
     holdout_views: int = 1
     """Views of each identity that are never trained on, chosen by the seed, to measure and show. At least one view
     of each identity is trained on. The paper: none."""
@@ -150,7 +153,7 @@ def check(config: TrainConfig) -> None:
     for name in ("rate", "rate_last", "eps"):
         value = getattr(training, name)
         require(value > 0 and math.isfinite(value), name, value, "give a positive number")
-    for name in ("warmup", "holdout_views", "seed", "clip", "interlevel"):
+    for name in ("warmup", "holdout_views", "seed", "clip", "interlevel", "opacity"):
         value = getattr(training, name)
         require(value >= 0 and math.isfinite(value), name, value, "give 0 or more")
     for name in ("micro_rays", "log_every", "validate_views"):
@@ -160,6 +163,12 @@ def check(config: TrainConfig) -> None:
         require(value >= 0 and math.isfinite(value), name, value, "give 0 or more")
     require(
         config.model.latent > 0, "model.latent", config.model.latent, "a prior needs codes; give 1 or more"
+    )
+    require(
+        training.opacity == 0 or config.model.background == "black",
+        "opacity",
+        training.opacity,
+        "masks say nothing about what is modelled behind the head; give 0, or --model.background black",
     )
     require(
         config.model.background != "captured",

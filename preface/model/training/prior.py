@@ -135,7 +135,7 @@ class _Run:
         rows = torch.from_numpy(data.row).to(device)
         self.trainer = Trainer(
             parameter_sets(self.model, config),
-            prior_terms(self.model.config.background, training.interlevel),
+            prior_terms(self.model.config.background, training),
             renderer(self.model, rows, planes, views, training.seed, training.steps),
             Options(eps=training.eps, micro_rays=config.run.micro_rays),
             pattern.groups,

@@ -12,6 +12,7 @@ from torch import Tensor
 from preface.model import losses
 from preface.model.model import PriorModel, Render
 from preface.model.rays import Rays
+from preface.model.training.configuration import TrainingConfig
 from preface.model.training.trainer import LossTerm, Part
 from preface.shards import Batch
 from preface.shards.streams import bits, stream_key
@@ -84,9 +85,15 @@ def interlevel(render: Render, part: Part) -> Tensor:
     return losses.interlevel(last.sdist, last.weights, proposals) * render.share
 
 
-def prior_terms(background: str, interlevel_weight: float) -> list[LossTerm]:
-    """The prior's objective (the paper, equation 2), and what is measured beside it."""
-    return [*color_terms(background), LossTerm("interlevel", interlevel_weight, interlevel)]
+def prior_terms(background: str, config: TrainingConfig) -> list[LossTerm]:
+    """The prior's objective (the paper, equation 2, and opacity if asked for), and what is measured beside it."""
+    terms = [*color_terms(background), LossTerm("interlevel", config.interlevel, interlevel)]
+    return [*terms, LossTerm("opacity", config.opacity, opacity)] if config.opacity > 0 else terms
+
+
+def opacity(render: Render, part: Part) -> Tensor:
+    """The mean absolute difference between opacity and mask; rays that miss the box have neither."""
+    return losses.l1(render.acc, (part.batch.alpha * part.batch.hit)[:, 0])
 
 
 def color_terms(background: str) -> list[LossTerm]:

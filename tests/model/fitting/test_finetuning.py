@@ -70,6 +70,19 @@ def test_the_objective_is_the_papers(head, data):
     assert {"normals", "view_weights"}.isdisjoint(values_of(finetuning_terms(head, none, None), head, data))
 
 
+def test_opacity_is_held_against_the_mask_where_it_is_asked_for(head, data):
+    asked = replace(small_fits.FINETUNING, opacity=0.5)
+    weight, value = values_of(finetuning_terms(head, asked, None), head, data)["opacity"]
+    batch = grids(data, 8)[0]
+    seen = head(Rays.from_batch(batch), code_of(head))
+    mask = np.where(batch.hit[:, 0].numpy(), batch.alpha[:, 0].numpy().astype(np.float64), 0.0)
+    assert weight == 0.5
+    assert 0 < mask.mean() < 1
+    np.testing.assert_allclose(
+        float(value.detach()), np.abs(seen.acc.detach().numpy() - mask).mean(), rtol=1e-5
+    )
+
+
 def test_the_view_penalty_is_on_the_columns_of_the_direction_alone(head, data):
     _, value = values_of(finetuning_terms(head, small_fits.FINETUNING, None), head, data)["view_weights"]
     columns = 3 + 6 * head.config.view_levels

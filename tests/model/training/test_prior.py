@@ -18,13 +18,16 @@ import torch
 from small_runs import config, quiet
 
 from preface.artifacts import ArtifactError
+from preface.model.rays import Rays
 from preface.model.training import prior as prior_module
 from preface.model.training.configuration import TrainingConfigError
+from preface.model.training.data import WholeViews
 from preface.model.training.lock import only_run
 from preface.model.training.logs import read_log
 from preface.model.training.prior import TrainingError, train_prior
 from preface.model.training.prior_files import read_prior
 from preface.model.training.trainer import Trainer
+from preface.shards import Dataset, Loader
 
 
 def tensors(folder):
@@ -56,6 +59,23 @@ def test_training_brings_unseen_views_closer(balls, tmp_path):
     assert psnr(tmp_path / "a") == curve[-1] > 16
     losses = [entry["loss"] for entry in read_log(tmp_path / "a" / "log.jsonl", "train")]
     assert losses[-1] < 0.5 * losses[0]
+
+
+def test_opacity_follows_masks_where_it_is_asked_for(balls, tmp_path):
+    """The heads' hair is black on black as far as colours can tell."""
+    training = {"steps": 60, "views": 3, "rays": 32, "holdout_views": 0}
+    found = {}
+    for weight in (0.0, 0.5):
+        train_prior(config(balls, tmp_path / str(weight), {**training, "opacity": weight}), quiet)
+        model = read_prior(tmp_path / str(weight)).load_model()
+        with Dataset(balls) as dataset, torch.no_grad():
+            loader = Loader(
+                dataset, WholeViews(dataset.index(), np.array([[0, 2]])), scale=dataset.manifest.scene_scale
+            )
+            batch = loader.batch(0)
+            seen = model(Rays.from_batch(batch), model.codes[:1])
+        found[weight] = float((seen.acc - (batch.alpha * batch.hit)[:, 0]).abs().mean())
+    assert found[0.5] < 0.8 * found[0.0]
 
 
 def test_the_template_of_the_shards_goes_with_the_prior(balls, tmp_path):
@@ -344,6 +364,8 @@ def test_memory_that_runs_out_says_what_to_lower(balls, tmp_path, monkeypatch, e
         ({"holdout_views": -1}, {}, {}, "--holdout-views -1"),
         ({}, {"micro_rays": 0}, {}, "--micro-rays 0"),
         ({}, {}, {"background": "captured"}, "no pictures of the empty studio"),
+        ({"opacity": 0.1}, {}, {"background": "modelled"}, "--opacity 0.1: .*masks say nothing"),
+        ({"opacity": -0.1}, {}, {}, "--opacity -0.1"),
         ({}, {}, {"latent": 0}, "a prior needs codes"),
     ],
 )
