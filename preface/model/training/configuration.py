@@ -117,15 +117,15 @@ class TrainConfig:
 TRAINING_PRESETS: dict[str, tuple[TrainingConfig, RunConfig]] = {
     "paper": (TrainingConfig(), RunConfig(micro_rays=4096)),
     "studio": (
-        TrainingConfig(steps=50_000, identities=32, views=4, rays=64),
+        TrainingConfig(steps=50_000, identities=32, views=4, rays=64, opacity=0.1),
         RunConfig(micro_rays=8192, validate_views=8),
     ),
     "small": (
-        TrainingConfig(steps=8_000, identities=16, views=4, rays=8, rate=5e-3, rate_last=1e-4),
+        TrainingConfig(steps=8_000, identities=16, views=4, rays=8, rate=5e-3, rate_last=1e-4, opacity=0.1),
         RunConfig(micro_rays=512, final_views=32),
     ),
     "tiny": (
-        TrainingConfig(steps=800, identities=16, views=4, rays=8, rate=5e-3, rate_last=2e-4),
+        TrainingConfig(steps=800, identities=16, views=4, rays=8, rate=5e-3, rate_last=2e-4, opacity=0.1),
         RunConfig(micro_rays=512, validate_every=400, final_views=8, faces_between=1),
     ),
 }
