@@ -32,7 +32,7 @@ from preface.model.rendering.paths import framing_camera, on_sphere
 from preface.model.rendering.shortcuts import accelerate
 from preface.model.training.prior_files import Prior, read_prior
 from preface.shards import Dataset
-from tradeoff.points import Point
+from tradeoff.points import NORMALS, Point
 
 RAYS_AT_A_TIME = 4096
 KEPT = ("rgb", "alpha", "depth")  # of the fullest render
@@ -102,7 +102,7 @@ def _render(
     code = model.codes[prior.identities.index(identity)] if model.config.latent else None
     standing = standing_camera(dataset, identity, camera)
     began = time.process_time()
-    normals = point.group == "opaque_normals"
+    normals = point.group in NORMALS
     render = accelerate(model, code, space, point.shortcuts, normals=normals)
     ready = time.process_time()
     image = render_image(

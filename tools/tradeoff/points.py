@@ -12,6 +12,7 @@ from preface.model.training.prior_files import Prior
 
 FULLEST = (128, 128, 64)  # samples, four times what presets for CPUs are trained with
 ALL = 8  # rounds, more than any model has
+NORMALS = ("opaque_normals", "predicted_normals")  # groups whose images are rendered with normals
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,8 @@ def _alone(prior: Prior, *, small: bool) -> Iterator[Point]:
     for bound in (0.005,) if small else (0.001, 0.005, 0.02):
         yield _one("weight_bound", weight_bound=bound)
         yield _one("color_bound", color_bound=bound)
-    yield _one("opaque_normals", opaque_normals=True)
+    for name in NORMALS:
+        yield _one(name, **{name: True})
 
 
 def _together(model: int, *, small: bool) -> Iterator[Point]:

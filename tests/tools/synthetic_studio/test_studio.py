@@ -240,6 +240,8 @@ def test_ctrl_c_ends_cleanly_and_says_how_to_resume(tmp_path):
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        # A shell that runs the tests in the background has told them to ignore what a terminal would send.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 300
     while not list(output.rglob("frame*.png")) and time.monotonic() < deadline:
