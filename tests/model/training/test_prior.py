@@ -235,7 +235,8 @@ def test_two_processes_take_the_steps_of_one(balls, straight, tmp_path):
         "1000000",
     ]
     arguments += ["--micro-rays", "64", "--steps", "20", "--identities", "3", "--views", "2", "--rays", "16"]
-    arguments += ["--rate", "0.01", "--rate-last", "0.001", "--clip", "0", "--validate-views", "1"]
+    arguments += ["--rate", "0.01", "--rate-last", "0.001", "--clip", "0", "--opacity", "0"]
+    arguments += ["--validate-views", "1"]
     for name, value in small_runs.MODEL.to_dict().items():
         values = value if isinstance(value, dict) else {"": value}
         for part, number in values.items():

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from preface.model.model import PriorModel
+from preface.model.training.configuration import TrainingConfig
 from preface.model.training.prior_loss import jitter, prior_terms, renderer
 from preface.model.training.trainer import (
     LossTerm,
@@ -79,7 +80,7 @@ def prior_trainer(balls, micro_rays, seed=3):
     pattern = PaperPattern(dataset.index("train"), 7, identities=3, views=4, rays=16)
     loader = Loader(dataset, pattern, scale=dataset.manifest.scene_scale)
     render = renderer(model, torch.arange(4), torch.zeros(24, 2), 6, seed=5, steps=10)
-    terms = prior_terms("black", 1.0)
+    terms = prior_terms("black", TrainingConfig())
     return Trainer(sets, terms, render, Options(micro_rays=micro_rays), pattern.groups), model, loader
 
 
