@@ -127,7 +127,9 @@ class FitConfig:
     """Which defaults all flags below have: for a minute and a half or for six on two processor cores with a small
     prior, or the paper's."""
     refine_cameras: bool = False
-    """Find small corrections of the cameras, too, in the last of inversion and while finetuning."""
+    """Find small corrections of the cameras, too, in the last of inversion and while finetuning. Not yet to be
+    trusted: with two views and a `small` prior it gave back a quarter of what cameras off by half a degree and 2 mm
+    cost, and cost 1.9 dB where the cameras were right (`tools/bench/camera_refinement.py`, one person, `draft`)."""
     seed: int = 0
     """Everything random follows from this number."""
     inversion: InversionConfig = field(default_factory=InversionConfig)
