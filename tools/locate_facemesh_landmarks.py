@@ -21,12 +21,12 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).parent))
 
 from preface.geometry import Camera, Rigid
+from preface.srgb import encode
 from synthetic_studio.facemesh import detect, look_at
 from synthetic_studio.heads import Head, build_head
 from synthetic_studio.raycasting import raycasting_scene
 from synthetic_studio.regions import head_regions
 from synthetic_studio.render import HeadRenderer
-from synthetic_studio.sensor import encode_srgb
 from synthetic_studio.template import head_template
 
 SEED = 990_001
@@ -64,7 +64,7 @@ def _positions_on_average(index: int) -> np.ndarray:
     for azimuth, elevation in VIEWS:
         pose = look_at(azimuth, elevation)
         image = np.round(
-            255.0 * encode_srgb(np.clip(renderer.render(CAMERA, pose, antialias=2).radiance, 0.0, 1.0))
+            255.0 * encode(np.clip(renderer.render(CAMERA, pose, antialias=2).radiance, 0.0, 1.0))
         ).astype(np.uint8)
         pixels = detect(image)
         rows.append(np.full((468, 3), np.nan) if pixels is None else _cast_back(head, pose, pixels[:468]))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,16 +17,15 @@ import numpy as np
 
 from ablation.design import FULL_PRIOR, HALF_PRIOR
 from preface.artifacts import ArtifactError, provenance
-from preface.geometry import Camera, Rigid, Views
 from preface.model.configuration import ModelConfig
-from preface.model.fitting.reduction import reduce_pixels
+from preface.model.fitting.reduction import reduced_head
 from preface.model.training.configuration import TRAINING_PRESETS, RunConfig, TrainConfig, TrainingConfig
 from preface.model.training.prior import train_prior
 from preface.model.training.prior_files import MODEL_FILE, Prior, read_prior
-from preface.shards import BACKGROUND_KINDS, Dataset
+from preface.shards import Dataset
 from preface.shards.building import build_manifest
 from preface.shards.manifest import MANIFEST_FILE
-from preface.shards.writer import Head, ShardWriter
+from preface.shards.writer import ShardWriter
 
 Say = Callable[[str], None]
 HEADS_PER_SHARD = 16
@@ -150,34 +149,7 @@ def halved_shards(dataset: Dataset, names: Sequence[str], split: str, folder: Pa
     parts = [names[begin : begin + HEADS_PER_SHARD] for begin in range(0, len(names), HEADS_PER_SHARD)]
     for number, part in enumerate(parts):
         with ShardWriter(folder, number, size, "raster", "halved") as shard:
-            for head in _heads(dataset, part, size):
-                shard.add(head)
+            for person in map(dataset.names.index, part):
+                shard.add(reduced_head(dataset, person, range(manifest.views), size))
     build_manifest(folder, len(parts), {split: list(names)}, history, made)
     return folder
-
-
-def _heads(dataset: Dataset, names: Sequence[str], size: tuple[int, int]) -> Iterator[Head]:
-    tables, manifest = dataset.tables, dataset.manifest
-    for name in names:
-        person = dataset.names.index(name)
-        entry = manifest.identities[person]
-        valid = tables["view_valid"][person] == 1
-        # A missing view gets the camera of one that there is, and is written as missing.
-        views = np.where(valid, np.arange(len(valid)), np.flatnonzero(valid)[0]).tolist()
-        cameras = [
-            Camera("FULL_OPENCV", manifest.width, manifest.height, tables["intrinsics"][person, view])
-            for view in views
-        ]
-        poses = [Rigid(m[:, :3], m[:, 3]) for m in tables["canonical_from_camera"][person, views]]
-        yield Head(
-            identity=entry.identity,
-            take=entry.take,
-            cameras=entry.cameras,
-            views=Views.stack([camera.resized(*size) for camera in cameras], poses),
-            pixels=np.stack([reduce_pixels(dataset.pixels(person, view), size) for view in views]),
-            box=tables["box"][person],
-            keypoints=tables["keypoints"][person],
-            backgrounds=[BACKGROUND_KINDS[kind] for kind in tables["background_kind"][person, views]],
-            sources=entry.sources,
-            metadata=entry.metadata,
-        )

@@ -37,7 +37,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from preface.artifacts import load_json, provenance, write_bytes
-from preface.geometry import Camera, Rigid, Views
+from preface.geometry import Rigid
 from preface.model.evaluation.evaluate import evaluate_head
 from preface.model.evaluation.options import EvaluationOptions
 from preface.model.fitting.cameras import corrected_pose
@@ -45,8 +45,9 @@ from preface.model.fitting.configuration import FitConfig, defaults
 from preface.model.fitting.run import fit_head
 from preface.model.matmul import denormals_flushed, keep_freed_memory
 from preface.model.training.prior_files import read_prior
-from preface.shards import BACKGROUND_KINDS, Dataset
+from preface.shards import Dataset
 from preface.shards.building import build_manifest
+from preface.shards.heads import head_of
 from preface.shards.manifest import MANIFEST_FILE
 from preface.shards.writer import Head, ShardWriter
 
@@ -271,24 +272,11 @@ def camera_errors(true: Poses, found: Poses, together: Rigid) -> dict[str, float
 
 def head_with(dataset: Dataset, identity: str, poses: Poses) -> Head:
     """An identity's views of some cameras, with these poses."""
-    person, tables = dataset.names.index(identity), dataset.tables
-    entry = dataset.manifest.identities[person]
-    names = [name for name in entry.cameras if name in poses]
-    views = [entry.cameras.index(name) for name in names]
-    size = dataset.manifest.width, dataset.manifest.height
-    lenses = [Camera("FULL_OPENCV", *size, tables["intrinsics"][person, view]) for view in views]
-    return Head(
-        identity=identity,
-        take=entry.take,
-        cameras=names,
-        views=Views.stack(lenses, [poses[str(name)] for name in names]),
-        pixels=np.stack([dataset.pixels(person, view) for view in views]),
-        box=tables["box"][person],
-        keypoints=tables["keypoints"][person],
-        backgrounds=[BACKGROUND_KINDS[kind] for kind in tables["background_kind"][person, views]],
-        sources=[entry.sources[view] for view in views],
-        metadata={},
-    )
+    person = dataset.names.index(identity)
+    cameras = dataset.manifest.identities[person].cameras
+    head = head_of(dataset, person, [view for view, name in enumerate(cameras) if name in poses])
+    placed = np.stack([poses[str(name)].matrix[:3] for name in head.cameras])
+    return replace(head, views=replace(head.views, world_from_camera=placed), metadata={})
 
 
 # ------------------------------------------------------------------------------------------ results

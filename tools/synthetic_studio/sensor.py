@@ -6,18 +6,12 @@ import cv2
 import numpy as np
 
 from preface.geometry.cameras import Camera
+from preface.srgb import encode
 from synthetic_studio.config import SensorConfig
 from synthetic_studio.streams import Stream, generator
 
 # Rows that are noised and encoded at a time: keeps a 25-megapixel image from needing gigabytes of scratch.
 BAND_ROWS = 256
-
-
-def encode_srgb(linear: np.ndarray) -> np.ndarray:
-    """sRGB-encode linear light in [0, 1], any shape (IEC 61966-2-1, the exact piecewise curve)."""
-    toe = 12.92 * linear
-    curve = 1.055 * np.power(np.maximum(linear, 0.0031308), 1 / 2.4) - 0.055
-    return np.where(linear <= 0.0031308, toe, curve)
 
 
 def vignetting(camera: Camera, strength: float) -> np.ndarray:
@@ -60,7 +54,7 @@ def expose(
         band = light[top : top + BAND_ROWS]
         if config.full_well > 0:
             band = _add_noise(band, config, noise)
-        encoded = encode_srgb(np.clip(band, 0.0, 1.0))
+        encoded = encode(np.clip(band, 0.0, 1.0))
         image[top : top + BAND_ROWS] = (encoded * 255 + 0.5).astype(np.uint8)
     return image
 

@@ -12,6 +12,7 @@ from preface.geometry import Camera, Rigid
 from preface.model.training.prior_files import Prior
 from preface.plain_words import suggestion
 from preface.shards import Dataset
+from preface.shards.heads import standing
 
 BOX_TOLERANCE = 1e-6  # metres; boxes are written in full, so that anything more is another box
 
@@ -134,10 +135,7 @@ def require_same_space(prior: Prior, dataset: Dataset) -> None:
 def standing_camera(dataset: Dataset, identity: str, name: str) -> StandingCamera:
     """The camera of a view that there is."""
     number, view = number_of(dataset, identity), camera_names(dataset, identity)[name]
-    width, height = dataset.manifest.width, dataset.manifest.height
-    camera = Camera("FULL_OPENCV", width, height, dataset.tables["intrinsics"][number, view])
-    pose = Rigid.from_matrix(dataset.tables["canonical_from_camera"][number, view])
-    return StandingCamera(name, camera, pose)
+    return StandingCamera(name, *standing(dataset, number, view))
 
 
 def face_square(standing: StandingCamera, half_side: float) -> Square | None:

@@ -22,6 +22,7 @@ from preface.model.rendering.shortcuts import DEFAULT_QUALITY, QUALITIES, accele
 from preface.model.training.data import TrainingData
 from preface.model.training.validation import ERROR_SHOWN, tile_size
 from preface.reports.pictures import Picture, as_picture, colorize, contact_sheet
+from preface.shards.heads import standing
 
 PIXELS = 2**13  # of a picture, at most; previews are to be looked at, not measured
 AWAY = math.radians(30)  # how far the new view is turned away from the front, about the vertical axis
@@ -97,10 +98,7 @@ class Previewer:
         return max(1, round(width * factor)), max(1, round(height * factor))
 
     def _camera(self, person: int, view: int) -> tuple[Camera, Rigid]:
-        tables = self.data.dataset.tables
-        camera = Camera("FULL_OPENCV", *self.data.scene.resolution, tables["intrinsics"][person, view])
-        pose = tables["canonical_from_camera"][person, view]
-        placed = Rigid(pose[:, :3], pose[:, 3])
+        camera, placed = standing(self.data.dataset, person, view)
         if self.correction is not None:
             row = int(self.correction.rows[view])
             names = [str(number) for number in range(len(self.pairs))]

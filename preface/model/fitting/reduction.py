@@ -9,19 +9,23 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from preface.artifacts import ArtifactError, provenance
-from preface.geometry import Rigid, Views
-from preface.geometry.cameras import Camera
+from preface.geometry import Camera
+from preface.geometry.cameras import stack_intrinsics
 from preface.model.training.data import TrainingData
-from preface.shards import BACKGROUND_KINDS
+from preface.shards import Dataset
 from preface.shards.building import build_manifest, claim, is_finished
+from preface.shards.heads import head_of
 from preface.shards.manifest import MANIFEST_FILE
 from preface.shards.writer import Head, ShardWriter
+from preface.srgb import encode, light_of_levels
 
 FOLDER = "inversion_views"
 
@@ -68,26 +72,24 @@ def reduce_views(data: TrainingData, size: tuple[int, int], folder: Path) -> Pat
         if is_finished(folder, 0, recipe) and (folder / MANIFEST_FILE).exists():
             return folder / MANIFEST_FILE
         with ShardWriter(folder, 0, size, "raster", recipe) as shard:
-            shard.add(_head(data, size))
+            person, views = int(data.train.identities[0]), data.train.pairs[:, 1].tolist()
+            shard.add(replace(reduced_head(data.dataset, person, views, size), metadata={}))
     return build_manifest(folder, 1, {"fit": [data.names[0]]}, history, made)
 
 
-def _head(data: TrainingData, size: tuple[int, int]) -> Head:
-    person, tables = int(data.train.identities[0]), data.dataset.tables
-    entry = data.dataset.manifest.identities[person]
-    views = data.train.pairs[:, 1].tolist()
-    cameras = [Camera("FULL_OPENCV", *data.scene.resolution, tables["intrinsics"][person, v]) for v in views]
-    poses = [Rigid(m[:, :3], m[:, 3]) for m in tables["canonical_from_camera"][person, views]]
-    return Head(
-        identity=entry.identity,
-        take=entry.take,
-        cameras=[entry.cameras[view] for view in views],
-        views=Views.stack([camera.resized(*size) for camera in cameras], poses),
-        pixels=np.stack([reduce_pixels(data.dataset.pixels(person, view), size) for view in views]),
-        box=tables["box"][person],
-        keypoints=tables["keypoints"][person],
-        backgrounds=[BACKGROUND_KINDS[kind] for kind in tables["background_kind"][person, views]],
-        sources=[entry.sources[view] for view in views],
+def reduced_head(dataset: Dataset, person: int, views: Sequence[int], size: tuple[int, int]) -> Head:
+    """Some views of an identity at a smaller size, none larger than the dataset's.
+
+    Raises:
+        ArtifactError: pixels cannot be read.
+    """
+    head, manifest = head_of(dataset, person, views), dataset.manifest
+    lenses = [Camera("FULL_OPENCV", manifest.width, manifest.height, i) for i in head.views.intrinsics]
+    intrinsics, radius = stack_intrinsics([lens.resized(*size) for lens in lenses])
+    return replace(
+        head,
+        views=replace(head.views, intrinsics=intrinsics, monotonic_radius=radius),
+        pixels=np.stack([reduce_pixels(pixels, size) for pixels in head.pixels]),
     )
 
 
@@ -102,29 +104,19 @@ def reduce_pixels(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         uint8 [h, w, 4]. Where nothing is foreground, colours are plain means.
     """
     alpha = pixels[..., 3:].astype(np.float32) / 255
-    light = _LIGHT[pixels[..., :3]]
+    light = light_of_levels(pixels.dtype)[pixels[..., :3]]
     mask = _area_means(alpha, size)
     weighted, plain = _area_means(light * alpha, size), _area_means(light, size)
     known = mask > 0
     colors = np.where(known, np.divide(weighted, mask, out=np.zeros_like(weighted), where=known), plain)
-    return np.rint(np.concatenate([_encoded(colors), mask], axis=-1) * 255).clip(0, 255).astype(np.uint8)
+    return (
+        np.rint(np.concatenate([encode(np.clip(colors, 0, 1)), mask], axis=-1) * 255)
+        .clip(0, 255)
+        .astype(np.uint8)
+    )
 
 
 def _area_means(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Means of [H, W, c] over the areas of [h, w, c], exact for any ratio."""
     found = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
     return found[..., None] if found.ndim == 2 else found
-
-
-def _light(encoded: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-
-
-def _encoded(light: np.ndarray) -> np.ndarray:
-    """sRGB values of linear light in [0, 1] (IEC 61966-2-1)."""
-    light = np.clip(light, 0, 1)
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-
-
-_LIGHT = _light(np.arange(256) / 255).astype(np.float32)  # of each byte

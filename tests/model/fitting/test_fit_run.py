@@ -8,11 +8,10 @@ import ball_heads
 import cv2
 import numpy as np
 import pytest
-import safetensors.torch
 import small_fits
 import torch
 from small_fits import config
-from small_runs import quiet
+from small_runs import assert_equal_bits, quiet, tensors
 
 from preface.artifacts import ArtifactError, provenance, read_artifact
 from preface.model.configuration import PRESETS
@@ -27,21 +26,6 @@ from preface.model.training.prior_files import read_prior
 from preface.model.training.trainer import Trainer
 from preface.shards.building import build_manifest
 from preface.shards.writer import ShardWriter
-
-
-def tensors(folder):
-    return {
-        f"{name}:{key}": value
-        for name in ("model", "training_state")
-        for key, value in safetensors.torch.load_file(folder / f"{name}.safetensors").items()
-    }
-
-
-def assert_equal_bits(one, other):
-    assert one.keys() == other.keys()
-    for name, value in one.items():
-        assert value.numpy().tobytes() == other[name].numpy().tobytes(), name
-
 
 REFINED = {"refine_cameras": True}
 

@@ -3,6 +3,9 @@
 from dataclasses import replace
 from pathlib import Path
 
+import safetensors.torch
+import torch
+
 from preface.model.configuration import ModelConfig, NetworkConfig
 from preface.model.training.configuration import RunConfig, TrainConfig, TrainingConfig
 
@@ -36,3 +39,18 @@ def config(shards: Path, output: Path, training=None, run=None, **model) -> Trai
 
 def quiet(words: str) -> None:
     """Says nothing."""
+
+
+def tensors(folder: Path) -> dict[str, torch.Tensor]:
+    """Everything that a checkpoint holds, by file and name."""
+    return {
+        f"{name}:{key}": value
+        for name in ("model", "training_state")
+        for key, value in safetensors.torch.load_file(folder / f"{name}.safetensors").items()
+    }
+
+
+def assert_equal_bits(one, other) -> None:
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        assert value.numpy().tobytes() == other[name].numpy().tobytes(), name

@@ -15,7 +15,7 @@ import pytest
 import safetensors.torch
 import small_runs
 import torch
-from small_runs import config, quiet
+from small_runs import assert_equal_bits, config, quiet, tensors
 
 from preface.artifacts import ArtifactError
 from preface.model.rays import Rays
@@ -28,20 +28,6 @@ from preface.model.training.prior import TrainingError, train_prior
 from preface.model.training.prior_files import read_prior
 from preface.model.training.trainer import Trainer
 from preface.shards import Dataset, Loader
-
-
-def tensors(folder):
-    return {
-        f"{name}:{key}": value
-        for name in ("model", "training_state")
-        for key, value in safetensors.torch.load_file(folder / f"{name}.safetensors").items()
-    }
-
-
-def assert_equal_bits(one, other):
-    assert one.keys() == other.keys()
-    for name, value in one.items():
-        assert value.numpy().tobytes() == other[name].numpy().tobytes(), name
 
 
 def psnr(folder):

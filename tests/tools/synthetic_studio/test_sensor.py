@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from preface.geometry.cameras import Camera
+from preface.srgb import encode as encode_srgb
 from synthetic_studio.config import SensorConfig
-from synthetic_studio.sensor import encode_srgb, expose, vignetting
+from synthetic_studio.sensor import expose, vignetting
 
 IDEAL = SensorConfig(blur=0, full_well=0, vignetting=0)
 
