@@ -22,20 +22,21 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import tyro
 
-from preface.artifacts import load_json, write_bytes
+from preface.artifacts import load_json, provenance, write_bytes
 from preface.capture.rig import read_rig
-from preface.geometry import Camera, Rigid, Similarity, Views, fit_similarity
+from preface.geometry import Rigid, Similarity, fit_similarity
 from preface.model.fitting.configuration import defaults
-from preface.shards import BACKGROUND_KINDS, Dataset
+from preface.shards import Dataset
 from preface.shards.building import build_manifest
-from preface.shards.writer import Head, ShardWriter
+from preface.shards.heads import head_of
+from preface.shards.writer import ShardWriter
 
 PERSON = "person"
 FIGURES = ("psnr", "ssim", "lpips", "psnr_face", "ssim_face", "lpips_face")
@@ -164,37 +165,34 @@ def _between(shipped: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray])
     """
     both = [name for name in found if name in shipped]
 
-    def points(poses: Mapping[str, np.ndarray]) -> np.ndarray:
-        distance = float(np.mean([np.linalg.norm(poses[name][:, 3]) for name in both]))
-        corners = distance * np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    def places(poses: Mapping[str, np.ndarray]) -> np.ndarray:
+        return np.stack([poses[name][:, 3] for name in both])
+
+    def points(poses: Mapping[str, np.ndarray], reach: float) -> np.ndarray:
+        corners = reach * np.concatenate([np.zeros((1, 3)), np.eye(3)])
         return np.concatenate([corners @ poses[name][:, :3].T + poses[name][:, 3] for name in both])
 
-    return fit_similarity(points(shipped), points(found)).target_from_source
+    reach = float(np.linalg.norm(places(shipped), axis=1).mean())
+    scale = _extent(places(found)) / _extent(places(shipped))
+    return fit_similarity(points(shipped, reach), points(found, scale * reach)).target_from_source
+
+
+def _extent(places: np.ndarray) -> float:
+    """The root mean square distance of places [n, 3] from their mean."""
+    return float(np.sqrt(places.var(axis=0).sum()))
 
 
 def _moved(dataset: Dataset, motion: Similarity, folder: Path) -> Path:
     """The first identity's views with cameras that were moved, as shards."""
     folder.mkdir(parents=True, exist_ok=True)
-    manifest, tables = dataset.manifest, dataset.tables
-    entry, size = manifest.identities[0], (manifest.width, manifest.height)
-    views = Views.stack(
-        [Camera("FULL_OPENCV", *size, intrinsics) for intrinsics in tables["intrinsics"][0]],
-        [motion.apply_to_pose(Rigid(m[:, :3], m[:, 3])) for m in tables["canonical_from_camera"][0]],
-    )
-    head = Head(
-        identity=entry.identity,
-        take=entry.take,
-        cameras=entry.cameras,
-        views=views,
-        pixels=np.stack([dataset.pixels(0, view) for view in range(manifest.views)]),
-        box=tables["box"][0],
-        keypoints=motion.apply(tables["keypoints"][0]),
-        backgrounds=[BACKGROUND_KINDS[kind] for kind in tables["background_kind"][0]],
-        sources=entry.sources,
-    )
+    size = dataset.manifest.width, dataset.manifest.height
+    head = head_of(dataset, 0, range(dataset.manifest.views))
+    poses = [motion.apply_to_pose(Rigid(m[:, :3], m[:, 3])) for m in head.views.world_from_camera]
+    placed = replace(head.views, world_from_camera=np.stack([pose.matrix[:3] for pose in poses]))
     with ShardWriter(folder, 0, size, "raster", "moved") as shard:
-        shard.add(head)
-    build_manifest(folder, 1, {"train": [entry.identity]}, {}, {})
+        shard.add(replace(head, views=placed, keypoints=motion.apply(head.keypoints)))
+    made = provenance({"moved": True}, {"manifest.json": dataset.manifest.path})
+    build_manifest(folder, 1, {"train": [head.identity]}, {}, made)
     return folder
 
 
