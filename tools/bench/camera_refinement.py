@@ -8,7 +8,7 @@ direction that the seed draws, each camera its own; the held-out cameras keep th
 equal:
 
     true                 the true cameras
-    true, refined        the same with --refine-cameras, which should change nothing
+    true, refined        the same with --refine-cameras, whose corrections should not be kept
     perturbed            the wrong cameras
     perturbed, refined   the same with --refine-cameras
 
@@ -41,7 +41,7 @@ from preface.geometry import Rigid
 from preface.model.evaluation.evaluate import evaluate_head
 from preface.model.evaluation.options import EvaluationOptions
 from preface.model.fitting.cameras import corrected_pose
-from preface.model.fitting.configuration import FitConfig, defaults
+from preface.model.fitting.configuration import CamerasConfig, FitConfig, defaults
 from preface.model.fitting.run import fit_head
 from preface.model.matmul import denormals_flushed, keep_freed_memory
 from preface.model.training.prior_files import read_prior
@@ -101,6 +101,7 @@ def _parser() -> argparse.ArgumentParser:
     fit = parser.add_argument_group("instead of the quality's")
     fit.add_argument("--inversion-steps", type=int)
     fit.add_argument("--finetuning-steps", type=int)
+    fit.add_argument("--camera-steps", type=int)
     fit.add_argument("--camera-rate", type=float)
     fit.add_argument("--camera-weight", type=float)
     parser.add_argument("--lpips", choices=("vgg", "none"), default="vgg")
@@ -152,10 +153,7 @@ class Bench:
             inversion = replace(inversion, steps=options.inversion_steps)
         if options.finetuning_steps is not None:
             finetuning = replace(finetuning, steps=options.finetuning_steps)
-        if options.camera_rate is not None:
-            finetuning = replace(finetuning, camera_rate=options.camera_rate)
-        if options.camera_weight is not None:
-            finetuning = replace(finetuning, camera_weight=options.camera_weight)
+        cameras = {name: getattr(options, f"camera_{name}") for name in ("steps", "rate", "weight")}
         return FitConfig(
             shards=options.shards if row.startswith("true") else self._perturbed_shards(),
             output=folder,
@@ -165,6 +163,7 @@ class Bench:
             quality=options.quality,
             refine_cameras=row.endswith("refined"),
             inversion=inversion,
+            cameras=replace(CamerasConfig(), **{k: v for k, v in cameras.items() if v is not None}),
             finetuning=finetuning,
             run=replace(run, preview_every=10**9, log_every=100),
         )
@@ -185,9 +184,10 @@ class Bench:
         for part, motion in zip(PARTS, (Rigid.identity(), together), strict=True):
             moved = {name: motion @ true[name] for name in held_out}
             with Dataset(self._shards_with(moved, folder / f"{part}-{digest}")) as dataset:
-                settings = EvaluationOptions(lpips=self.options.lpips)
+                settings = EvaluationOptions(lpips=self.options.lpips, normals=False)
                 mean = evaluate_head(head, dataset, self.identity, held_out, settings).mean
             figures[part] = {name: mean[name] for name in FIGURES if name in mean}
+        figures["refinement"] = dict((head.fit or {}).get("refinement", {}))
         figures["cameras"] = camera_errors(true, found, Rigid.identity())
         figures["cameras_relative"] = camera_errors(true, found, together)
         return figures

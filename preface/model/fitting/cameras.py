@@ -1,4 +1,4 @@
-"""Corrections of the cameras of a fit, learned together with the head.
+"""Corrections of the cameras of a fit.
 
 The paper names the error of its calibration as a limit of its results: at a metre, half a degree shifts a picture by
 nine millimetres. A correction turns a camera about its own centre and then moves the centre, both along the axes of the
@@ -47,6 +47,20 @@ class CameraCorrections(nn.Module):
         super().__init__()
         self.rotation = nn.Parameter(torch.zeros(views, 3))
         self.translation = nn.Parameter(torch.zeros(views, 3))
+
+    @classmethod
+    def of(
+        cls, known: Mapping[str, Mapping[str, Any]], cameras: Sequence[str], scene_scale: float
+    ) -> CameraCorrections:
+        """Those that `described` gave, none for a camera that is not among them."""
+        made = cls(len(cameras))
+        with torch.no_grad():
+            for row, name in enumerate(cameras):
+                if name in known:
+                    moved = torch.tensor(known[name]["translation_m"], dtype=torch.float64)
+                    made.rotation[row] = torch.tensor(known[name]["rotation"], dtype=torch.float64)
+                    made.translation[row] = moved * scene_scale
+        return made
 
     def apply(self, rays: Rays, view: Tensor, box: Box, scene_scale: float) -> Rays:  # type: ignore[override]
         """The rays of the corrected cameras.

@@ -43,8 +43,26 @@ class InversionConfig:
     """Weight of LPIPS beside the absolute difference; 0 does without. The paper: 0.2."""
     network: Literal["vgg", "alex"] = "vgg"
     """The network of LPIPS. The paper does not say."""
-    camera_share: float = 1 / 3
-    """With --refine-cameras: the last share of the steps, in which the cameras are refined, too. Not in the paper."""
+
+
+@dataclass(frozen=True)
+class CamerasConfig:
+    """With --refine-cameras, after inversion: small corrections of the cameras. Not in the paper."""
+
+    steps: int = 40
+    """Steps in which cameras alone move; inversion's follow once more if the corrections are kept."""
+    rays: int = 512
+    """Rays per step, from the boxes around the head's pixels."""
+    rate: float = 1e-3
+    """Learning rate of the first step, radians and scene units."""
+    rate_last: float = 5e-5
+    """Learning rate of the last step; it falls by the same factor at each."""
+    weight: float = 3e-4
+    """Weight of the pull to the cameras that were given. See `CameraCorrections.penalty`: this counts as many
+    independent pixels as stand against deviations of half a degree and 2 mm."""
+    least_gain: float = 0.8
+    """Corrections are kept if the views are met better by this much, dB of the mean squared error. With a `small`
+    prior right cameras gained 0.1 to 0.5, cameras off by half a degree and 2 mm 1.1 to 4.5."""
 
 
 @dataclass(frozen=True)
@@ -79,11 +97,6 @@ class FinetuningConfig:
     """Weight of the squared norm of the weights that see the direction; 0 does without. The paper: 0.0001."""
     frozen_latent: bool = False
     """Keep the code that inversion found, and adapt the networks only."""
-    camera_rate: float = 5e-4
-    """Learning rate of refined cameras, radians and scene units; it falls as the other does."""
-    camera_weight: float = 3e-5
-    """Weight of the pull of refined cameras to where they were. See `CameraCorrections.penalty`: this counts as
-    many independent pixels as stand against deviations of half a degree and 2 mm."""
 
 
 @dataclass(frozen=True)
@@ -117,8 +130,9 @@ class FitConfig:
     """Folder of the shards that hold the views."""
     output: Path = Path("head")
     """Folder of the head."""
-    prior: Literal["none"] | Path = Path("prior")
-    """Folder of the prior; `none` trains the model of --model from random weights without a code, the baseline."""
+    prior: Literal["pretrained", "none"] | Path = "pretrained"
+    """Folder of the prior; `pretrained` is the one that comes with preface, of synthetic heads (a folder of this name
+    is ./pretrained); `none` trains the model of --model from random weights without a code, the baseline."""
     identity: str | None = None
     """Whose views; may be left out where the shards hold one identity only."""
     views: tuple[str, ...] = ()
@@ -127,18 +141,19 @@ class FitConfig:
     """Which defaults all flags below have: for a minute and a half or for six on two processor cores with a small
     prior, or the paper's."""
     refine_cameras: bool = False
-    """Find small corrections of the cameras, too, in the last of inversion and while finetuning. Not yet to be
-    trusted: with two views and a `small` prior it gave back a quarter of what cameras off by half a degree and 2 mm
-    cost, and cost 1.9 dB where the cameras were right (`tools/bench/camera_refinement.py`, one person, `draft`)."""
+    """Find small corrections of the cameras, too, and keep them if the views agree much better with them. Takes a
+    prior."""
     seed: int = 0
     """Everything random follows from this number."""
     inversion: InversionConfig = field(default_factory=InversionConfig)
+    cameras: CamerasConfig = field(default_factory=CamerasConfig)
     finetuning: FinetuningConfig = field(default_factory=FinetuningConfig)
     run: Annotated[FitRunConfig, tyro.conf.arg(name="")] = field(default_factory=FitRunConfig)
     model: ModelConfig = field(default_factory=lambda: PRESETS["small"])
     """The architecture for --prior none; its latent is not used."""
-    like: Path | None = None
-    """With --prior none: a prior whose architecture is taken instead, so that only its knowledge is missing."""
+    like: Literal["pretrained"] | Path | None = None
+    """With --prior none: a prior whose architecture is taken instead, so that only its knowledge is missing; a folder,
+    or `pretrained`."""
 
     @property
     def from_prior(self) -> bool:
@@ -158,6 +173,7 @@ class FitConfig:
             "refine_cameras": self.refine_cameras,
             "seed": self.seed,
             "inversion": asdict(self.inversion) if self.from_prior else None,
+            "cameras": asdict(self.cameras) if self.refine_cameras else None,
             "finetuning": asdict(self.finetuning),
             "model": None if self.from_prior else self.model.to_dict(),
         }
@@ -227,7 +243,8 @@ def check(config: FitConfig) -> None:
     least = LEAST_PATCH[inversion.network] if inversion.lpips > 0 else 1
     _check_numbers("inversion.", inversion, {"steps": 0, "patches": 1, "patch": least, "lpips": 0})
     _check_rates("inversion.", inversion, ("rate",))
-    _check_share("inversion.camera-share", inversion.camera_share)
+    if config.refine_cameras:
+        _check_cameras(config)
     numbers: dict[str, float] = {
         "rays": 1,
         "clip": 0,
@@ -235,12 +252,11 @@ def check(config: FitConfig) -> None:
         "opacity": 0,
         "normals": 0,
         "view_weights": 0,
-        "camera_weight": 0,
     }
     if finetuning.steps != "auto":
         numbers["steps"] = 0
     _check_numbers("finetuning.", finetuning, numbers)
-    _check_rates("finetuning.", finetuning, ("rate", "rate_last", "eps", "camera_rate"))
+    _check_rates("finetuning.", finetuning, ("rate", "rate_last", "eps"))
     _check_share("finetuning.foreground-share", finetuning.foreground_share)
     limits = {"micro_rays": 1, "log_every": 1, "checkpoint_minutes": 0, "preview_every": 0}
     _check_numbers("", run, limits)
@@ -254,6 +270,14 @@ def _check_views(views: tuple[str, ...]) -> None:
     twice = [name for name in views if views.count(name) > 1]
     if twice:
         raise TrainingConfigError(f"--views {twice[0]}: is there twice; name each camera once")
+
+
+def _check_cameras(config: FitConfig) -> None:
+    cameras = config.cameras
+    remedy = "leave it out, or fit from a prior: without one nothing says where the head is"
+    require(config.from_prior, "refine-cameras", True, remedy)
+    _check_numbers("cameras.", cameras, {"steps": 1, "rays": 1, "weight": 0, "least_gain": 0})
+    _check_rates("cameras.", cameras, ("rate", "rate_last"))
 
 
 def _check_numbers(prefix: str, values: Any, limits: Mapping[str, float]) -> None:

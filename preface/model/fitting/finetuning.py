@@ -11,7 +11,7 @@ from torch import Tensor
 
 from preface.model import losses
 from preface.model.fitting.configuration import FinetuningConfig
-from preface.model.fitting.heads import Correction, camera_set, camera_term, head_renderer
+from preface.model.fitting.heads import Correction, head_renderer
 from preface.model.fitting.observations import view_loader
 from preface.model.model import PriorModel, Render
 from preface.model.training.data import TrainingData
@@ -45,7 +45,7 @@ def finetuning_trainer(
         device: where.
         knows_heads: whether the weights are a prior's, whose proposals say where to look from the first step on;
             others are annealed as a prior is.
-        correction: of the cameras, refined together with the head.
+        correction: of the cameras, if there is one; fixed.
     """
     for parameter in model.parameters():
         parameter.requires_grad_()
@@ -55,8 +55,8 @@ def finetuning_trainer(
 
     sampler = SingleRays(data.train, seed, config.rays, config.foreground_share)
     trainer = Trainer(
-        parameter_sets(model, config, steps, correction),
-        finetuning_terms(model, config, correction),
+        parameter_sets(model, config, steps),
+        finetuning_terms(model, config),
         head_renderer(model, seed, share_done, correction),
         Options(eps=config.eps, micro_rays=micro_rays),
         sampler.groups,
@@ -64,29 +64,21 @@ def finetuning_trainer(
     return trainer, view_loader(data, sampler, device)
 
 
-def parameter_sets(
-    model: PriorModel, config: FinetuningConfig, steps: int, correction: Correction | None
-) -> list[ParameterSet]:
-    """Each network, the code and the corrections of cameras, clipped by themselves."""
+def parameter_sets(model: PriorModel, config: FinetuningConfig, steps: int) -> list[ParameterSet]:
+    """Each network and the code, clipped by themselves."""
     rate = LogLinear(config.rate, config.rate_last, max(steps, 1))
     names = {id(parameter): name for name, parameter in model.named_parameters()}
     frozen = config.frozen_latent or not model.config.latent
     model.codes.requires_grad_(not frozen)
-    sets = [
+    return [
         ParameterSet(name, {names[id(p)]: p for p in parameters}, rate, config.clip or None)
         for name, parameters in model.parameter_groups().items()
         if not (name == "codes" and frozen)
     ]
-    if correction is not None:
-        last = config.camera_rate * config.rate_last / config.rate
-        sets.append(camera_set(correction, LogLinear(config.camera_rate, last, max(steps, 1))))
-    return sets
 
 
-def finetuning_terms(
-    model: PriorModel, config: FinetuningConfig, correction: Correction | None
-) -> list[LossTerm]:
-    """The paper's objective, equation 3; if asked for, opacity; and the pull of refined cameras to their places."""
+def finetuning_terms(model: PriorModel, config: FinetuningConfig) -> list[LossTerm]:
+    """The paper's objective, equation 3; and opacity, if asked for."""
     terms = [*color_terms("black"), LossTerm("interlevel", config.interlevel, interlevel)]
     if config.opacity > 0:
         terms.append(LossTerm("opacity", config.opacity, opacity))
@@ -99,8 +91,6 @@ def finetuning_terms(
             return losses.view_weight_penalty(layer, features)
 
         terms.append(LossTerm("view_weights", config.view_weights, view_weights))
-    if correction is not None:
-        terms.append(camera_term(correction, config.camera_weight))
     return terms
 
 

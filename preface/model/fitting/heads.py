@@ -18,7 +18,7 @@ from preface.model.fitting.cameras import CameraCorrections
 from preface.model.model import PriorModel, Render
 from preface.model.rays import Rays
 from preface.model.training.prior_loss import jitter
-from preface.model.training.trainer import LossTerm, ParameterSet, Part
+from preface.model.training.trainer import Part
 
 
 def head_config(model: ModelConfig) -> ModelConfig:
@@ -80,21 +80,6 @@ class Correction:
         return self.cameras.apply(rays, self.rows[view], self.box, self.scale)
 
 
-def camera_set(correction: Correction, rate: Callable[[int], float]) -> ParameterSet:
-    """The corrections as parameters that are not clipped."""
-    moved = {f"cameras.{name}": p for name, p in correction.cameras.named_parameters()}
-    return ParameterSet("cameras", moved, rate, None)
-
-
-def camera_term(correction: Correction, weight: float) -> LossTerm:
-    """The pull of refined cameras to where they were."""
-
-    def moved(render: Render, part: Part) -> Tensor:
-        return correction.cameras.penalty(correction.scale)
-
-    return LossTerm("cameras", weight, moved)
-
-
 def head_renderer(
     model: PriorModel, seed: int, share_done: Callable[[int], float], correction: Correction | None = None
 ) -> Callable[[Part], Render]:
@@ -104,7 +89,7 @@ def head_renderer(
         model: with one code or none.
         seed: of the places of samples.
         share_done: of a step, for annealing; 1 for networks that know where to look.
-        correction: of the cameras, if they are refined.
+        correction: of the cameras, if there is one.
     """
     rounds = len(model.config.samples)
 

@@ -8,14 +8,13 @@ about the box of the foreground instead, they brought a code no further in as ma
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from preface.artifacts import ArtifactError
 from preface.model.fitting.configuration import LEAST_PATCH, InversionConfig
-from preface.model.fitting.heads import Correction, camera_set, camera_term, head_renderer
+from preface.model.fitting.heads import Correction, head_renderer
 from preface.model.fitting.observations import view_loader
 from preface.model.metrics.lpips import Lpips
 from preface.model.metrics.lpips_weights import load_lpips
@@ -24,21 +23,6 @@ from preface.model.training.data import TrainingData
 from preface.model.training.prior_loss import color_terms, target_colors
 from preface.model.training.trainer import LossTerm, Options, ParameterSet, Part, Trainer
 from preface.shards import Loader, Patches
-
-
-@dataclass(frozen=True, eq=False)
-class Refined:
-    """Cameras that are refined together with the code, in the last of its steps, once it is somebody like the head.
-
-    Attributes:
-        correction: of the views as inversion sees them.
-        rate: of a step.
-        weight: of the pull to where the cameras were.
-    """
-
-    correction: Correction
-    rate: float
-    weight: float
 
 
 def patch_size(config: InversionConfig, data: TrainingData) -> int:
@@ -64,11 +48,11 @@ def inversion_trainer(
     seed: int,
     micro_rays: int,
     device: torch.device,
-    refined: Refined | None = None,
+    correction: Correction | None = None,
 ) -> tuple[Trainer, Loader]:
     """What takes inversion's steps, and what gives them their rays.
 
-    The networks of the model are frozen: only its code has a gradient, and cameras that are refined.
+    The networks of the model are frozen: only its code has a gradient.
 
     Args:
         model: a head, on the device.
@@ -77,7 +61,7 @@ def inversion_trainer(
         seed: of patches and samples.
         micro_rays: rays at a time; patches are kept whole.
         device: where.
-        refined: the cameras, if they are refined.
+        correction: of the cameras, if there is one; fixed.
 
     Raises:
         ArtifactError: the weights of LPIPS are missing, or the views too small for it.
@@ -88,15 +72,9 @@ def inversion_trainer(
         terms.append(LossTerm("lpips", config.lpips, perceptual(load_lpips(config.network).to(device), size)))
     for parameter in model.parameters():
         parameter.requires_grad_(parameter is model.codes)
-    sets = [ParameterSet("codes", {"codes": model.codes}, lambda step: config.rate, None)]
-    correction = None
-    if refined is not None:
-        correction, first = refined.correction, config.steps * (1 - config.camera_share)
-        sets.append(camera_set(correction, lambda step: refined.rate if step >= first else 0.0))
-        terms.append(camera_term(correction, refined.weight))
     sampler = Patches(data.train, seed, config.patches, size)
     trainer = Trainer(
-        sets,
+        [ParameterSet("codes", {"codes": model.codes}, lambda step: config.rate, None)],
         terms,
         head_renderer(model, seed, lambda step: 1.0, correction),
         Options(micro_rays=max(micro_rays, size * size)),

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from preface.artifacts import ArtifactError
+from preface.artifacts import ArtifactError, read_artifact
 from preface.model.training.data import TrainingData, check_finite
+from preface.model.training.folder import TEMPLATE_FILE
 from preface.model.training.prior_files import Prior, Scene
 from preface.plain_words import suggestion
 from preface.shards import Batch, Dataset, Loader, Pick, Sampler, ViewIndex
@@ -71,6 +72,23 @@ def fitted_views(data: TrainingData, cameras: Sequence[str]) -> np.ndarray:
     person = int(data.train.identities[0])
     known = data.dataset.manifest.identities[person].cameras
     return np.array([(person, known.index(camera)) for camera in cameras], dtype=np.int64)
+
+
+def template_gap(dataset: Dataset, prior: Prior) -> float | None:
+    """How far the template of the shards' people is from that of the prior's.
+
+    Returns:
+        The root mean square distance of their five keypoints, metres; None where one of them is not known.
+
+    Raises:
+        ArtifactError: a template that is none.
+    """
+    files = [path.parent / TEMPLATE_FILE for path in (dataset.manifest.path, prior.path)]
+    if not all(file.exists() for file in files):
+        return None
+    one, other = (read_artifact(file, "preface/template")["keypoints"] for file in files)
+    between = np.array([one[name] for name in one]) - np.array([other[name] for name in one])
+    return float(np.sqrt((between**2).sum(axis=1).mean()))
 
 
 def _person(dataset: Dataset, identity: str | None) -> int:

@@ -2,8 +2,9 @@
 
     ended = fit_head(FitConfig(Path("shards"), Path("head"), Path("prior"), "id0007", ("cam03", "cam09")), say=print)
 
-Both phases go through `preface.model.training.loop`, one after the other, and into one checkpoint: its step counts
-those of inversion, then those of finetuning.
+All phases go through `preface.model.training.loop`, one after the other, and into one checkpoint, whose step counts
+those of inversion, then those of finetuning. Between them, if cameras are refined, lie the steps in which these move,
+and those of inversion once more, which are skipped when the corrections are not kept.
 """
 
 from __future__ import annotations
@@ -12,22 +13,23 @@ import contextlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-from preface.artifacts import ArtifactError, provenance, sha256
+from preface.artifacts import ArtifactError, provenance
 from preface.geometry import Box
 from preface.model.configuration import ModelConfig
 from preface.model.fitting.cameras import CameraCorrections
-from preface.model.fitting.configuration import FitConfig, check, finetuning_steps
+from preface.model.fitting.configuration import FitConfig, check
+from preface.model.fitting.description import described_head, ends_of, inputs_of
 from preface.model.fitting.finetuning import finetuning_trainer
 from preface.model.fitting.heads import Correction, head_from_scratch, head_of_prior, with_predicted_normals
-from preface.model.fitting.inversion import Refined, inversion_trainer
-from preface.model.fitting.observations import fitted_views, grids, observe
+from preface.model.fitting.inversion import inversion_trainer
+from preface.model.fitting.observations import fitted_views, grids, observe, template_gap
 from preface.model.fitting.previews import Previewer
 from preface.model.fitting.reduction import FOLDER, reduce_views, reduced_size
+from preface.model.fitting.refinement import gain, refinement_trainer
 from preface.model.fitting.starts import start_code
 from preface.model.model import PriorModel
 from preface.model.training.checkpoint import STATE, WEIGHTS, read_tensors, write_checkpoint
@@ -45,6 +47,7 @@ from preface.model.training.trainer import Outcome, Trainer
 from preface.shards import Dataset, Loader
 
 PREVIEWS = "previews"
+_SAME_TEMPLATE = 1e-3  # metres; keypoints are found to some millimetres
 _COMPARED = 16  # pixels per side of a view that neighbours are sought by
 
 
@@ -65,11 +68,13 @@ def fit_head(config: FitConfig, say: Say) -> Ended:
         device = device_of_rank(config.run.device)
     except ValueError as error:
         raise TrainingConfigError(str(error)) from error
-    prior = _read_prior(Path(config.prior), say) if config.from_prior else None
+    prior = _read_prior(config.prior, say) if config.from_prior else None
     if config.like is not None:
         config = replace(config, model=read_prior(config.like).model)
     with Dataset(config.shards) as dataset:
         data = observe(dataset, config.identity, config.views, prior)
+        if prior is not None:
+            _note_template(dataset, prior, say)
         config = replace(config, identity=data.names[0])
         with held_folder(config.output, Ranks()):
             before = _resumed(config, data, prior)
@@ -79,16 +84,27 @@ def fit_head(config: FitConfig, say: Say) -> Ended:
             return _Fit(config, data, prior, before, device, say).go()
 
 
-def _read_prior(path: Path, say: Say) -> Prior:
+def _read_prior(path: str | Path, say: Say) -> Prior:
     prior = read_prior(path)
     if prior.is_head:
         problem = "is that of a head, which knows one identity"
         raise ArtifactError(prior.path, "fit", problem, "Give the folder of a prior, or --prior none")
     if not prior.finished:
         say(
-            f"{prior.path}: trained for {prior.step:,} of {prior.steps:,} steps only; the fit can be as good as that"
+            f"{path}: trained for {prior.step:,} of {prior.steps:,} steps only; the fit can be as good as that"
         )
     return prior
+
+
+def _note_template(dataset: Dataset, prior: Prior, say: Say) -> None:
+    """Tell of faces that are elsewhere than the prior expects them."""
+    gap = template_gap(dataset, prior)
+    if gap is not None and gap > _SAME_TEMPLATE:
+        say(
+            f"note: the people of {dataset.manifest.path.parent} were placed on another template than the prior's, "
+            f"{1e3 * gap:.1f} mm away (RMS); align them with preface-align --template and the prior's folder, or the "
+            "word pretrained"
+        )
 
 
 def _resumed(config: FitConfig, data: TrainingData, prior: Prior | None) -> Prior | None:
@@ -103,18 +119,20 @@ def _resumed(config: FitConfig, data: TrainingData, prior: Prior | None) -> Prio
     if not before.is_head:
         problem = "is that of a prior, which a fit would overwrite"
         raise ArtifactError(before.path, "fit", problem, "Choose another --output")
-    inputs = provenance({}, _inputs(data, prior))["inputs"]
+    inputs = provenance({}, inputs_of(data, prior))["inputs"]
     ours = {**config.to_dict(), "inputs": inputs}
     require_same_run(before.path, ours, {**before.configuration, "inputs": dict(before.provenance["inputs"])})
     return before
 
 
-def _inputs(data: TrainingData, prior: Prior | None) -> dict[str, Path]:
-    return {"manifest.json": data.dataset.manifest.path, **({} if prior is None else {"prior": prior.path})}
-
-
 def _preview(folder: Path, step: int) -> Path:
     return folder / PREVIEWS / f"views-{step:08d}.png"
+
+
+def _may_correct(before: Prior) -> bool:
+    """Whether the checkpoint's corrections were kept, or are not judged yet."""
+    assert before.fit is not None
+    return bool(before.fit.get("refinement", {"kept": True})["kept"])
 
 
 class _Fit:
@@ -133,17 +151,19 @@ class _Fit:
         self.output, self.ranks = config.output, Ranks()
         self._open = contextlib.ExitStack()
         self._prior, self._before = prior, before
-        self._inversion_steps = config.inversion_steps()
-        self._finetuning_steps = finetuning_steps(config.finetuning, *data.scene.resolution)
+        self._ends = ends_of(config, *data.scene.resolution)
         self._pairs = fitted_views(data, config.views)
         self._phase: Phase | None = None
-        self._correction = self._corrections(before) if config.refine_cameras else None
+        self._correction = None
+        if config.refine_cameras and (before is None or _may_correct(before)):
+            self._correction = self._corrections(before)
+        self._reduced: TrainingData | None = None
         self.model, self.head = self._new() if before is None else (before.load_model().to(device), before)
 
     # -------------------------------------------------------------------------------------- the phases
 
     def go(self) -> Ended:
-        """Invert and finetune until all steps are taken or a signal comes."""
+        """Invert, correct the cameras and finetune, until all steps are taken or a signal comes."""
         run = self.config.run
         with self._open:
             interruption = self._open.enter_context(Interruption())
@@ -152,7 +172,7 @@ class _Fit:
             products = chosen_products(self.head.model, self.head.products, run.products, self.device)
             route = self._open.enter_context(products)
             self.head = replace(self.head, products=route.name)
-            for prepare in (self._inversion, self._finetuning):
+            for prepare in (self._inversion, self._refinement, self._second_inversion, self._finetuning):
                 phase = prepare()
                 if phase is None:
                     continue
@@ -161,7 +181,7 @@ class _Fit:
                 progress = Progress(phase.steps, train_flops_per_ray(self.model), 1e9 * route.gflops)
                 if not take_steps(self, phase, progress, log, interruption):
                     return Ended(self.head.path, interruption.exit_status)
-            if self._phase is None:  # no steps at all
+            if not _preview(self.output, self.head.step).exists():  # the last phase had no steps
                 self.save()
                 self.look(log, last=True)
         return Ended(self.head.path, 0)
@@ -170,9 +190,10 @@ class _Fit:
         if self._before is not None:
             return f"goes on from step {self.head.step:,} of {self.output}"
         width, height = self.data.scene.resolution
+        cameras = f"{self.config.cameras.steps:,} of cameras, " if self.config.refine_cameras else ""
         return (
-            f"{self.data.names[0]}: {len(self._pairs)} views of {width}x{height}; {self._inversion_steps:,} steps of "
-            f"inversion, {self._finetuning_steps:,} of finetuning"
+            f"{self.data.names[0]}: {len(self._pairs)} views of {width}x{height}; {self._ends.inversion:,} steps of "
+            f"inversion, {cameras}{self._ends.finetuning - self._ends.second_inversion:,} of finetuning"
         )
 
     def _new(self) -> tuple[PriorModel, Prior]:
@@ -182,73 +203,102 @@ class _Fit:
             model = head_from_scratch(config.model.resolved(self.data.smallest_radius), config.seed)
             return model.to(self.device), self._described(model.config)
         networks = self._prior.load_model().to(self.device)
-        views = grids(self.data, _COMPARED, self.device)
-        head = head_of_prior(networks, start_code(networks, config.inversion.start, views, config.seed))
+        head = head_of_prior(networks, self._start_code(networks))
         return head, self._described(head.config)
 
     def _described(self, model: ModelConfig) -> Prior:
-        """What model.json says of the head before its first step."""
-        config, data = self.config, self.data
-        configuration = config.to_dict()
-        width, height = data.scene.resolution
-        fit = {
-            "identity": data.names[0],
-            "views": list(config.views),
-            "shards": {"manifest": sha256(data.dataset.manifest.path), "path": str(config.shards)},
-            "resolution": {"width": width, "height": height},
-            "prior": None if self._prior is None else sha256(self._prior.path),
-            "inversion": {"steps": self._inversion_steps, "loss": None},
-            "finetuning": {"steps": self._finetuning_steps},
-            "cameras": {},
-            "quality": config.quality,
-        }
-        return Prior(
-            path=self.output / MODEL_FILE,
-            model=model,
-            identities=data.names,
-            scene=data.scene,
-            configuration=configuration,
-            step=0,
-            steps=self._inversion_steps + self._finetuning_steps,
-            held_out=data.held_out_names,
-            validation={},
-            products="",
-            provenance=provenance(configuration, _inputs(data, self._prior), config.seed),
-            files={},
-            fit=fit,
-        )
+        return described_head(self.config, self.data, self._prior, model, self._ends)
+
+    def _start_code(self, networks: PriorModel) -> Tensor:
+        views = grids(self.data, _COMPARED, self.device)
+        return start_code(networks, self.config.inversion.start, views, self.config.seed)
 
     def _inversion(self) -> Phase | None:
         """The steps of inversion that are left; None if there are none."""
-        steps = self._inversion_steps
-        if self.head.step >= steps:
-            return None
-        assert self._prior is not None
-        size = reduced_size(self.data.scene.resolution, self._prior.scene.resolution)
-        data = self.data
-        if size != data.scene.resolution:
-            manifest = reduce_views(data, size, self.output / FOLDER)
-            data = observe(
-                self._open.enter_context(Dataset(manifest)), data.names[0], self.config.views, self._prior
-            )
-        config, run, finetuning = self.config.inversion, self.config.run, self.config.finetuning
-        refined = None
-        if self._correction is not None:
-            correction = self._correction
-            if data is not self.data:  # whose views are those fitted to, in the same order
-                rows = correction.rows[torch.from_numpy(self.data.train.pairs[:, 1]).to(self.device)]
-                correction = replace(correction, rows=rows)
-            refined = Refined(correction, finetuning.camera_rate, finetuning.camera_weight)
+        return self._inverting(0, None) if self.head.step < self._ends.inversion else None
+
+    def _inverting(self, before: int, correction: Correction | None) -> Phase:
+        """Inversion after so many steps of the run."""
+        data = self._as_the_prior_sees()
+        config, run = self.config.inversion, self.config.run
         trainer, loader = inversion_trainer(
-            self.model, config, data, self.config.seed, run.micro_rays, self.device, refined
+            self.model, config, data, self.config.seed, run.micro_rays, self.device, correction
         )
         less = f"--inversion.patches {max(config.patches // 2, 1)} or a smaller --inversion.patch"
         remedy = "fit into another --output with a lower --inversion.rate"
-        return self._phase_of("inversion", trainer, loader, 0, steps, remedy, f"fit again with {less}")
+        steps = self._ends.inversion
+        return self._phase_of("inversion", trainer, loader, before, steps, remedy, f"fit again with {less}")
+
+    def _refinement(self) -> Phase | None:
+        """The steps in which cameras move that are left; None if there are none."""
+        if self._correction is None or self.head.step >= self._ends.cameras:
+            return None
+        data = self._as_the_prior_sees()
+        correction = self._seen_through(self._correction, data)
+        config, run = self.config.cameras, self.config.run
+        trainer, loader = refinement_trainer(
+            self.model, config, data, self.config.seed, run.micro_rays, self.device, correction
+        )
+        less = f"--micro-rays {max(run.micro_rays // 2, 1)}, which changes nothing but the time"
+        remedy = "fit into another --output with a lower --cameras.rate"
+        before, steps = self._ends.inversion, config.steps
+        return self._phase_of("cameras", trainer, loader, before, steps, remedy, f"fit again with {less}")
+
+    def _second_inversion(self) -> Phase | None:
+        """Inversion's steps with corrected cameras that are left; None without, or where they are not kept."""
+        correction = self._correction
+        if correction is None or self.head.step >= self._ends.second_inversion or not self._kept(correction):
+            return None
+        phase = self._inverting(self._ends.cameras, self._seen_through(correction, self._as_the_prior_sees()))
+        if phase.start == 0:
+            assert self._prior is not None
+            with torch.no_grad():
+                self.model.codes.copy_(self._start_code(self._prior.load_model().to(self.device))[None])
+        return phase
+
+    def _kept(self, correction: Correction) -> bool:
+        """Whether the corrections are kept, found out once; if not, the second inversion counts as done."""
+        assert self.head.fit is not None
+        if "refinement" not in self.head.fit:
+            data, least = self._as_the_prior_sees(), self.config.cameras.least_gain
+            found = gain(self.model, self._seen_through(correction, data), data, self.device)
+            kept = found >= least
+            fit = {**self.head.fit, "refinement": {"gain_db": found, "kept": kept}}
+            self.head = replace(self.head, fit=fit)
+            words = "kept" if kept else "the cameras stay as they were"
+            self.say(
+                f"cameras: views are met {found:+.2f} dB better, of the {least:g} dB that it takes: {words}"
+            )
+        if (self.head.fit or {})["refinement"]["kept"]:
+            return True
+        self._correction = None
+        fit = {**(self.head.fit or {}), "cameras": {}}
+        self.head = replace(self.head, step=self._ends.second_inversion, fit=fit)
+        return False
+
+    def _as_the_prior_sees(self) -> TrainingData:
+        """The views at the prior's resolution."""
+        if self._reduced is None:
+            assert self._prior is not None
+            data = self.data
+            size = reduced_size(data.scene.resolution, self._prior.scene.resolution)
+            if size != data.scene.resolution:
+                views = self._open.enter_context(Dataset(reduce_views(data, size, self.output / FOLDER)))
+                data = observe(views, data.names[0], self.config.views, self._prior)
+            self._reduced = data
+        return self._reduced
+
+    def _seen_through(self, correction: Correction, data: TrainingData) -> Correction:
+        """The correction for rays of `data`: reduced views are those fitted to, in the same order, without others."""
+        if data is self.data:
+            return correction
+        rows = correction.rows[torch.from_numpy(self.data.train.pairs[:, 1]).to(self.device)]
+        return replace(correction, rows=rows)
 
     def _finetuning(self) -> Phase | None:
         """The steps of finetuning that are left; None if there are none."""
-        steps, config, run = self._finetuning_steps, self.config.finetuning, self.config.run
+        steps = self._ends.finetuning - self._ends.second_inversion
+        config, run = self.config.finetuning, self.config.run
         if steps == 0:
             return None
         if config.normals > 0:
@@ -268,7 +318,13 @@ class _Fit:
         less = f"--micro-rays {max(run.micro_rays // 2, 1)}, which changes nothing but the time"
         remedy = "fit into another --output with a lower --finetuning.rate"
         return self._phase_of(
-            "finetuning", trainer, loader, self._inversion_steps, steps, remedy, f"fit again with {less}"
+            "finetuning",
+            trainer,
+            loader,
+            self._ends.second_inversion,
+            steps,
+            remedy,
+            f"fit again with {less}",
         )
 
     def _phase_of(
@@ -296,18 +352,11 @@ class _Fit:
 
     def _corrections(self, before: Prior | None) -> Correction:
         """Corrections of the cameras: none at first, or those of the checkpoint."""
-        scene, person = self.data.scene, int(self._pairs[0, 0])
-        cameras = CameraCorrections(len(self._pairs))
-        known: Mapping[str, Any] = {} if before is None else cast(Mapping[str, Any], before.fit)["cameras"]
-        with torch.no_grad():
-            for row, name in enumerate(self.config.views):
-                if name in known:
-                    cameras.rotation[row] = torch.tensor(known[name]["rotation"], dtype=torch.float64)
-                    moved = torch.tensor(known[name]["translation_m"], dtype=torch.float64)
-                    cameras.translation[row] = moved * scene.scene_scale
-        rows = torch.full((self.data.dataset.tables["view_valid"].shape[1],), -1)
+        known = {} if before is None or before.fit is None else before.fit["cameras"]
+        scene, views = self.data.scene, self.data.dataset.tables["view_valid"].shape[1]
+        cameras = CameraCorrections.of(known, self.config.views, scene.scene_scale)
+        rows = torch.full((views,), -1)
         rows[torch.from_numpy(self._pairs[:, 1])] = torch.arange(len(self._pairs))
-        assert (self._pairs[:, 0] == person).all()
         box = Box(scene.box[0], scene.box[1])
         return Correction(cameras.to(self.device), rows.to(self.device), box, scene.scene_scale)
 

@@ -8,7 +8,13 @@ import small_runs
 import torch
 from small_runs import quiet
 
-from preface.model.fitting.configuration import FinetuningConfig, FitConfig, FitRunConfig, InversionConfig
+from preface.model.fitting.configuration import (
+    CamerasConfig,
+    FinetuningConfig,
+    FitConfig,
+    FitRunConfig,
+    InversionConfig,
+)
 from preface.model.fitting.heads import code_of
 from preface.model.fitting.observations import observe
 from preface.model.rays import Rays
@@ -20,6 +26,7 @@ from preface.shards import Dataset, Loader
 
 UNSEEN, VIEWS = "id0003", ("camera1", "camera4")
 INVERSION = InversionConfig(steps=8, patches=2, patch=12, rate=3e-2, lpips=0.0)
+CAMERAS = CamerasConfig(steps=4, rays=64, least_gain=0)
 FINETUNING = FinetuningConfig(steps=8, rays=64, rate=1e-3, rate_last=1e-4)
 RUN = FitRunConfig(device="cpu", products="mkl", micro_rays=512, log_every=2, preview_every=0)
 
@@ -32,7 +39,9 @@ def train(shards: Path, folder: Path, **model) -> None:
     )
 
 
-def config(shards: Path, prior, output: Path, inversion=None, finetuning=None, run=None, **rest) -> FitConfig:
+def config(
+    shards: Path, prior, output: Path, inversion=None, finetuning=None, run=None, cameras=None, **rest
+) -> FitConfig:
     """A fit with some fields changed."""
     chosen = {"identity": UNSEEN, "views": VIEWS, "quality": "draft", "model": small_runs.MODEL, **rest}
     return FitConfig(
@@ -40,6 +49,7 @@ def config(shards: Path, prior, output: Path, inversion=None, finetuning=None, r
         output=output,
         prior=prior,
         inversion=replace(INVERSION, **(inversion or {})),
+        cameras=replace(CAMERAS, **(cameras or {})),
         finetuning=replace(FINETUNING, **(finetuning or {})),
         run=replace(RUN, **(run or {})),
         **chosen,

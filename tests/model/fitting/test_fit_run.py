@@ -11,7 +11,7 @@ import pytest
 import small_fits
 import torch
 from small_fits import config
-from small_runs import assert_equal_bits, quiet, tensors
+from small_runs import assert_equal_bits, quiet, tensors, words_of_log
 
 from preface.artifacts import ArtifactError, provenance, read_artifact
 from preface.model.configuration import PRESETS
@@ -58,14 +58,41 @@ def test_the_baseline_may_have_the_architecture_of_a_prior(balls, prior, tmp_pat
     refused(replace(given, like=None), r"model\.")
 
 
-@pytest.mark.parametrize(("share", "moved"), [(0.0, False), (0.5, True)])
-def test_cameras_are_refined_in_the_last_share_of_inversion(balls, prior, tmp_path, share, moved):
-    choices = {"inversion": {"camera_share": share}, "finetuning": {"steps": 0}, **REFINED}
-    fit_head(config(balls, prior, tmp_path / "a", **choices), quiet)
-    cameras = read_prior(tmp_path / "a").fit["cameras"]
-    assert set(cameras) == set(small_fits.VIEWS)
-    turned = np.array([camera["rotation"] for camera in cameras.values()])
-    assert (np.abs(turned).max(axis=1) > 0).all() == np.any(turned) == moved
+def test_corrections_that_gain_too_little_leave_the_fit_as_if_none_had_been_sought(balls, prior, tmp_path):
+    said = []
+    ended = fit_head(
+        config(balls, prior, tmp_path / "a", cameras={"least_gain": 99.0}, **REFINED), said.append
+    )
+    fit_head(config(balls, prior, tmp_path / "b"), quiet)
+    refused_, never = (read_prior(tmp_path / name) for name in "ab")
+    assert ended.status == 0
+    assert any("stay as they were" in words for words in said)
+    assert refused_.fit["refinement"]["kept"] is False
+    assert refused_.fit["cameras"] == never.fit["cameras"] == {}
+    weights = [head.load_model().state_dict() for head in (refused_, never)]
+    assert_equal_bits(*weights)
+    assert (refused_.step, never.step) == (28, 16)
+    assert (
+        fit_head(config(balls, prior, tmp_path / "a", cameras={"least_gain": 99.0}, **REFINED), quiet).status
+        == 0
+    )
+
+
+def test_a_fit_without_finetuning_ends_in_order_when_corrections_are_refused(balls, prior, tmp_path):
+    here = config(balls, prior, tmp_path / "a", None, {"steps": 0}, None, {"least_gain": 99.0}, **REFINED)
+    assert fit_head(here, quiet).status == 0
+    assert read_prior(tmp_path / "a").finished
+
+
+def test_cameras_without_a_prior_have_nothing_to_agree_with(balls, tmp_path):
+    with pytest.raises(TrainingConfigError, match=r"--refine-cameras.*fit from a prior"):
+        fit_head(config(balls, "none", tmp_path / "a", **REFINED), quiet)
+
+
+def test_the_page_of_logs_describes_every_value_of_every_line(straight):
+    kinds, undescribed = words_of_log(straight / "log.jsonl")
+    assert kinds == {"inversion", "cameras", "finetuning", "preview"}
+    assert undescribed == set()
 
 
 def test_a_head_says_what_it_is(balls, prior, straight):
@@ -73,14 +100,15 @@ def test_a_head_says_what_it_is(balls, prior, straight):
     head = read_prior(straight)
     assert head.is_head
     assert not read_prior(prior).is_head
-    assert (head.identities, head.step, head.steps) == ((small_fits.UNSEEN,), 16, 16)
+    assert (head.identities, head.step, head.steps) == ((small_fits.UNSEEN,), 28, 28)
     assert head.fit["views"] == list(small_fits.VIEWS)
     assert head.fit["prior"] == provenance({}, {"p": prior / "model.json"})["inputs"]["p"]
     assert head.fit["inversion"]["steps"] == head.fit["finetuning"]["steps"] == 8
     logged = read_log(straight / "log.jsonl", "inversion")
-    assert [entry["step"] for entry in logged] == [2, 4, 6, 8]
+    assert [entry["step"] for entry in logged] == [2, 4, 6, 8, 14, 16, 18, 20]
+    assert [entry["step"] for entry in read_log(straight / "log.jsonl", "cameras")] == [10, 12]
     assert head.fit["inversion"]["loss"] < 2 * logged[-1]["loss"]
-    assert [entry["step"] for entry in read_log(straight / "log.jsonl", "finetuning")] == [10, 12, 14, 16]
+    assert [entry["step"] for entry in read_log(straight / "log.jsonl", "finetuning")] == [22, 24, 26, 28]
     assert head.held_out == {small_fits.UNSEEN: ("camera0", "camera2", "camera3", "camera5")}
     assert set(head.fit["cameras"]) == set(small_fits.VIEWS)
     assert head.model.predicted_normals
@@ -90,24 +118,31 @@ def test_a_head_says_what_it_is(balls, prior, straight):
 
 def test_pictures_show_each_view_after_each_phase(straight):
     sheets = sorted((straight / "previews").iterdir())
-    assert [sheet.name for sheet in sheets] == ["views-00000008.png", "views-00000016.png"]
+    assert [sheet.name for sheet in sheets] == [f"views-{step:08d}.png" for step in (8, 12, 20, 28)]
     picture = cv2.imread(str(sheets[-1]))
     assert picture.shape[1] > 6 * ball_heads.WIDTH
     assert picture.std() > 10
     assert len(read_log(straight / "log.jsonl", "preview")[-1]["psnr"]) == len(small_fits.VIEWS)
 
 
-@pytest.mark.parametrize("stopped", [4, 8, 12])
-def test_a_fit_that_is_interrupted_in_either_phase_goes_on_bit_for_bit(
-    balls, prior, straight, tmp_path, stopped
+PHASES = {"inversion": 0, "cameras": 8, "inversion again": 12, "finetuning": 20}
+
+
+@pytest.mark.parametrize(
+    ("phase", "local"),
+    [("inversion", 4), ("inversion", 8), ("cameras", 2), ("inversion again", 4), ("finetuning", 4)],
+)
+def test_a_fit_that_is_interrupted_in_any_phase_goes_on_bit_for_bit(
+    balls, prior, straight, tmp_path, phase, local
 ):
     here = config(balls, prior, tmp_path / "head", **REFINED)
     said = []
-    phase, local = ("inversion", stopped) if stopped <= 8 else ("finetuning", stopped - 8)
+    stopped, kind = PHASES[phase] + local, phase.split()[0]
 
     def say(words):
         said.append(words)
-        if words.startswith(f"{phase}: step {local:>7,} of"):
+        due = words.startswith(f"{kind}: step {local:>7,} of")
+        if due and (phase != "inversion again" or any("kept" in earlier for earlier in said)):
             os.kill(os.getpid(), signal.SIGINT)
 
     ended = fit_head(here, say)
@@ -119,7 +154,7 @@ def test_a_fit_that_is_interrupted_in_either_phase_goes_on_bit_for_bit(
     assert fit_head(here, quiet).status == 0
     assert_equal_bits(tensors(tmp_path / "head"), tensors(straight))
     assert read_prior(tmp_path / "head").fit == read_prior(straight).fit
-    for kind in ("inversion", "finetuning"):
+    for kind in ("inversion", "cameras", "finetuning"):
         ours, theirs = (
             [entry["step"] for entry in read_log(folder / "log.jsonl", kind)]
             for folder in (tmp_path / "head", straight)
@@ -139,7 +174,7 @@ def test_a_fit_that_is_killed_between_the_phases_goes_on_bit_for_bit(
         patched.setattr(run_module, "finetuning_trainer", killed)
         with pytest.raises(KeyboardInterrupt):
             fit_head(here, quiet)
-    assert read_prior(tmp_path / "head").step == 8
+    assert read_prior(tmp_path / "head").step == PHASES["finetuning"]
     fit_head(here, quiet)
     assert_equal_bits(tensors(tmp_path / "head"), tensors(straight))
 
