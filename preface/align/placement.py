@@ -22,6 +22,7 @@ from preface.geometry import GeometryError, Similarity, SimilarityFit, fit_simil
 # Scales that a rig in another unit has: how many template metres one of its units is.
 _UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches", 0.3048: "feet", 1e3: "kilometres"}
 _UNIT_TOLERANCE = 1.35  # faces differ by less
+_NO_FACE = 2.0  # times larger or smaller than the template: not the face, but the unit
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,16 @@ class Placement:
     flags: tuple[Flag, ...]
 
 
-def place_subject(keypoints: Keypoints, template: Template, options: AlignmentOptions) -> Placement:
+def place_subject(
+    keypoints: Keypoints, template: Template, options: AlignmentOptions, metric: bool = True
+) -> Placement:
     """Fit the similarity that brings a subject's keypoints onto the template.
+
+    Args:
+        keypoints: in the rig's frame.
+        template: see there.
+        options: see there.
+        metric: whether the rig's lengths are said to be metres. If they are not, the size of the face says nothing.
 
     Raises:
         AlignmentError: too few keypoints, none that agree with the template, or left and right exchanged: the
@@ -80,7 +89,10 @@ def place_subject(keypoints: Keypoints, template: Template, options: AlignmentOp
         canonical_from_rig=fit.target_from_source,
         residuals=np.where(good, np.linalg.norm(moved - template.keypoints, axis=-1), np.nan),
         weights=fit.weights / fit.weights.sum(),
-        flags=(*_scale_flags(keypoints, template, fit, options), *_shape_flags(good, fit, threshold)),
+        flags=(
+            *(_scale_flags(keypoints, template, fit, options) if metric else ()),
+            *_shape_flags(good, fit, threshold),
+        ),
     )
 
 
@@ -128,11 +140,18 @@ def _scale_flags(
         scale = template.eye_distance / float(eye_distance(keypoints.positions))
     if 1 / options.scale_tolerance <= scale <= options.scale_tolerance:
         return ()
-    unit = _unit(scale)
-    if unit:
-        return (Flag("unit", f"its scale of {scale:.4g} says that its rig is in {unit}; correct the rig"),)
-    size = f"its face is {1 / scale:.3g} times as large as the template's"
-    return (Flag("scale", f"{size}; check the square size of the calibration board and the keypoints"),)
+    unit, size = _unit(scale), f"its face is {1 / scale:.3g} times as large as the template's"
+    if not unit and 1 / _NO_FACE < scale < _NO_FACE:
+        return (Flag("scale", f"{size}; check the square size of the calibration board and the keypoints"),)
+    said = f"{size}, as with a rig in {unit}" if unit else size
+    if options.scale == "fixed":
+        return (Flag("unit", f"{said}; correct the rig"),)
+    # One number does not tell the two apart, and where the scale is fitted, neither does harm.
+    text = (
+        f"{said}, or with one whose scale is arbitrary (cameras from photographs alone): the head gets the template's "
+        "size either way, so correct the rig only if it should be metric"
+    )
+    return (Flag("unit", text),)
 
 
 def _shape_flags(good: np.ndarray, fit: SimilarityFit, threshold: float) -> Sequence[Flag]:

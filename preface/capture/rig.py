@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from preface.geometry.errors import GeometryError
 from preface.geometry.transforms import Rigid
 
 SCHEMA = "preface/rig"
+Scale = Literal["metric", "arbitrary"]
 
 
 @dataclass(frozen=True)
@@ -108,13 +109,17 @@ class RigCamera:
 
 @dataclass(frozen=True)
 class Rig:
-    """The calibrated cameras of one take, by id, in the file's order."""
+    """The calibrated cameras of one take, by id, in the file's order.
+
+    Where the scale is arbitrary, nothing said how long a metre is: lengths are in a unit of the rig's own.
+    """
 
     take: str
     cameras: Mapping[str, RigCamera]
     held_out_reprojection_error: HeldOutError | None = None
     provenance: Mapping[str, Any] | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
+    scale: Scale = "metric"
 
 
 def read_rig(path: str | os.PathLike[str]) -> Rig:
@@ -140,6 +145,7 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
         held_out_reprojection_error=HeldOutError(**held_out) if held_out else None,
         provenance=payload.get("provenance"),
         metadata=payload.get("metadata", {}),
+        scale=payload.get("scale", "metric"),
     )
 
 
@@ -156,6 +162,7 @@ def write_rig(path: str | os.PathLike[str], rig: Rig) -> Path:
         "schema_version": 1,
         "take": rig.take,
         "units": "metre",
+        **({} if rig.scale == "metric" else {"scale": rig.scale}),
         "cameras": entries,
     }
     if rig.held_out_reprojection_error is not None:

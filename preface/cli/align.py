@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from preface.cli.output import exit_status, resumable, whole_number
+from preface.model.pretrained import prior_flag, prior_path
 
 _DESCRIPTION = "Find the face in every view and bring all faces into one canonical frame."
 _EPILOG = "Exit status: 0 when the alignment was written, 1 when something is wrong, 2 for wrong usage."
@@ -37,13 +38,19 @@ def _reasons() -> tuple[type[Exception], ...]:
 def _run_studio(config: argparse.Namespace) -> list[str]:
     from preface.cli.align_studio import run
 
+    config.template = _template_path(config.template)
     return run(config)
 
 
 def _run_photos(config: argparse.Namespace) -> list[str]:
     from preface.cli.align_photos import run
 
+    config.template = _template_path(config.template)
     return run(config)
+
+
+def _template_path(given: str | Path | None) -> Path | None:
+    return None if given is None else prior_path(given)
 
 
 # --------------------------------------------------------------------------------------- the flags
@@ -86,10 +93,11 @@ def _add_studio(commands: Any) -> None:
     template = parser.add_argument_group("the canonical frame")
     template.add_argument(
         "--template",
-        type=Path,
+        type=prior_flag,
         metavar="FILE",
-        help="place everybody on this template (template.json, or the folder of an alignment) instead of making "
-        "one: so a new person joins an old prior",
+        help="place everybody on this template (template.json, or the folder of an alignment or of a prior; "
+        "`pretrained` is that of the prior that comes with preface) instead of making one: so a new person joins an "
+        "old prior",
     )
     template.add_argument(
         "--identities",
@@ -125,9 +133,10 @@ def _add_photos(commands: Any) -> None:
     )
     parser.add_argument(
         "--template",
-        type=Path,
+        type=prior_flag,
         metavar="FILE",
-        help="place the person on this template (template.json, or the folder of an alignment)",
+        help="place the person on this template (template.json, or the folder of an alignment or of a prior; "
+        "`pretrained` is that of the prior that comes with preface)",
     )
     parser.add_argument("--identity", metavar="NAME", help="name of the person (default: the folder's)")
     parser.add_argument(

@@ -51,6 +51,7 @@ def run(config: argparse.Namespace) -> list[str]:
     rigs, notes = rigs_of_takes(config.rig, list(dict.fromkeys(subject.take for subject in subjects)))
     given = read_template(config.template) if config.template else None
     photographs, unusable = usable_photographs(capture, subjects, rigs)
+    _require_metric(rigs, config)
     make_folder(config.output)
     landmarks = landmarks_of(config, photographs)
     found = {
@@ -77,6 +78,19 @@ def _options(config: argparse.Namespace) -> AlignmentOptions:
     if config.identities:
         chosen["template_identities"] = config.identities
     return AlignmentOptions(**chosen)
+
+
+def _require_metric(rigs: Mapping[str, TakeRig], config: argparse.Namespace) -> None:
+    """Refuse a rig of arbitrary scale where its lengths would count as metres."""
+    for entry in rigs.values():
+        if entry.rig.scale == "metric" or (config.template and config.scale == "free"):
+            continue
+        if config.template:
+            problem, remedy = "arbitrary, and --scale fixed would keep it", "Leave --scale fixed away"
+        else:
+            problem = "arbitrary, so that no template can be made with this rig"
+            remedy = "Give --template, or calibrate with a known distance"
+        raise ArtifactError(entry.path, "scale", problem, remedy)
 
 
 # --------------------------------------------------------------------------------------- alignment
@@ -107,6 +121,7 @@ def align_people(
         subject.id: align_subject(_views_of(subject.id, found), rigs[subject.take], options, bias)
         for subject in subjects
     }
+    takes = {subject.id: rigs[subject.take] for subject in subjects}
     usable = {identity: face for identity, face in faces.items() if face.excluded is None}
     excluded = {identity: face.excluded for identity, face in faces.items() if face.excluded is not None}
     schemes = list(dict.fromkeys(face.scheme for face in usable.values()))
@@ -119,12 +134,13 @@ def align_people(
         require_same_scheme(template, schemes)
         for identity, face in usable.items():
             try:
-                placements[identity] = place_subject(face.keypoints, template, options)
+                metric = takes[identity].scale == "metric"
+                placements[identity] = place_subject(face.keypoints, template, options, metric)
             except AlignmentError as error:
                 excluded[identity] = str(error)
     return AlignedStudio(
         landmarks=found,
-        rigs={subject.id: rigs[subject.take] for subject in subjects},
+        rigs=takes,
         subjects=faces,
         template=template,
         joined=given is not None,

@@ -83,7 +83,8 @@ def _run_import(config: argparse.Namespace) -> list[str]:
     source = config.source
     files = [source] if source.is_file() else sorted(f for f in source.iterdir() if f.is_file())
     history = provenance({"command": "import", "format": config.format}, {file.name: file for file in files})
-    written = write_rig(config.output, replace(rig, take=config.take or rig.take, provenance=history))
+    named = replace(rig, take=config.take or rig.take, scale=config.scale, provenance=history)
+    written = write_rig(config.output, named)
     assumed = [f"assumed: {words}" for words in rig.metadata["imported"]["assumptions"]]
     return [
         f"{len(rig.cameras)} cameras of format {rig.metadata['imported']['format']}",
@@ -236,6 +237,13 @@ def _add_import(commands: Any) -> None:
     parser = _command(commands, "import", _run_import, words, "SOURCE: its file or folder")
     parser.add_argument("--format", choices=FORMATS, help="default: found out")
     parser.add_argument("--take", metavar="NAME", help="name of the take (default: default)")
+    parser.add_argument(
+        "--scale",
+        choices=("metric", "arbitrary"),
+        default="metric",
+        help="whether its lengths are metres, or nothing said how long a metre is, as in COLMAP's own models; no "
+        "format says which (default: metric)",
+    )
     parser.add_argument(
         "--output", type=Path, default=Path("rig.json"), metavar="PATH", help="default: rig.json"
     )

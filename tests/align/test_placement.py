@@ -128,6 +128,21 @@ def test_a_rig_in_another_unit_is_flagged_and_named(units_per_metre, name):
     np.testing.assert_allclose(placement.residuals, 0, atol=1e-12)
 
 
+def test_a_unit_is_not_taken_for_granted_where_the_scale_is_fitted_and_may_be_arbitrary():
+    (flag,) = place_subject(moved(1 / 0.0254), template(), FREE).flags
+    assert "39.4 times as large as the template's, as with a rig in inches, or" in flag.text
+    assert "scale is arbitrary" in flag.text
+    (odd,) = place_subject(moved(7.3), template(), FREE).flags
+    assert odd.code == "unit"
+    assert "7.3 times as large as the template's, or with one whose scale is arbitrary" in odd.text
+
+
+def test_the_size_of_a_face_says_nothing_where_the_scale_is_known_to_be_arbitrary():
+    placement = place_subject(moved(1 / 0.0254), template(), FREE, metric=False)
+    assert placement.flags == ()
+    np.testing.assert_allclose(placement.residuals, 0, atol=1e-12)
+
+
 def test_with_a_fixed_scale_another_unit_is_refused_and_named():
     with pytest.raises(AlignmentError, match=r"rig seems to be in millimetres.*correct the rig"):
         place_subject(moved(1000), template(), FIXED)

@@ -56,6 +56,7 @@ def test_everything_that_was_written_is_read(tmp_path):
         HeldOutError(0.24, 480),
         provenance({"model": "OPENCV"}, {}, seed=0),
         {"note": "x"},
+        "arbitrary",
     )
     write_rig(tmp_path / "rig.json", rig)
     again = read_rig(tmp_path / "rig.json")

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import made_up_studio as made
 import numpy as np
@@ -18,7 +19,7 @@ from preface.align.report import alignment_report
 from preface.artifacts import load_json
 from preface.capture.images import write_png
 from preface.capture.manifest import CaptureCamera, Manifest, Subject, Take, write_capture
-from preface.capture.rig import write_rig
+from preface.capture.rig import read_rig, write_rig
 from preface.cli.align import main
 from preface.reports import Report
 
@@ -155,6 +156,27 @@ def test_people_who_stand_elsewhere_are_brought_together_by_procrustes(capture):
 def test_a_metric_rig_may_keep_its_scale(capture):
     assert align(capture, "--scale", "fixed") == 0
     assert of(capture, "bert")["canonical_from_rig"]["scale"] == 1
+
+
+def test_a_rig_of_arbitrary_scale_serves_a_given_template_and_makes_none(capture, capsys):
+    """As `preface-calibrate photos` leaves it: nothing is said about the size of faces, and no head has it."""
+    assert align(capture, output="metric") == 0
+    rig, template = read_rig(capture.parent / "rig.json"), capture.parent / "metric"
+    inches = {
+        name: replace(camera, translation=tuple(39.37 * x for x in camera.translation))
+        for name, camera in rig.cameras.items()
+    }
+    path = write_rig(capture.parent / "own.json", replace(rig, cameras=inches, scale="arbitrary"))
+    capsys.readouterr()
+    assert align(capture, "--template", template, output="own", rig=path) == 0
+    assert "inches" not in capsys.readouterr().err
+    moves = [of(capture, "bert", output)["canonical_from_rig"]["scale"] for output in ("own", "metric")]
+    assert moves[0] * 39.37 == pytest.approx(moves[1])
+    assert align(capture, output="none", rig=path) == 1
+    assert "own.json: scale: arbitrary, so that no template can be made" in capsys.readouterr().err
+    assert align(capture, "--template", template, "--scale", "fixed", output="none", rig=path) == 1
+    assert "--scale fixed would keep it" in capsys.readouterr().err
+    assert not (capture.parent / "none").exists()
 
 
 def test_a_second_run_gives_the_same_bytes(capture):

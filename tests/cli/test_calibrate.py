@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from preface.artifacts import read_artifact
+from preface.artifacts import SCHEMA_DIRECTORY, read_artifact
 from preface.capture.corners import Corners, write_corners
 from preface.capture.formats import FORMATS as KNOWN_FORMATS
 from preface.capture.images import write_png
@@ -317,6 +317,15 @@ def test_a_rig_goes_out_and_comes_back(capture, corners, tmp_path, capsys):
     for name, camera in rig.cameras.items():
         assert np.array_equal(again.cameras[name].camera.intrinsics, camera.camera.intrinsics)
         assert np.allclose(again.cameras[name].translation, camera.translation, rtol=0, atol=1e-12)
+
+
+def test_an_imported_rig_may_be_of_arbitrary_scale(tmp_path):
+    example, source = SCHEMA_DIRECTORY / "rig.example.json", tmp_path / "transforms.json"
+    assert run("export", example, "--format", "nerfstudio", "--output", source) == 0
+    for scale, words in (("metric", ()), ("arbitrary", ("--scale", "arbitrary"))):
+        back = tmp_path / f"{scale}.json"
+        assert run("import", source, *words, "--output", back) == 0
+        assert read_rig(back).scale == scale
 
 
 def test_a_file_of_no_known_format_says_what_was_tried(tmp_path, capsys):

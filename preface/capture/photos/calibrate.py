@@ -133,7 +133,10 @@ def calibrate_photos(
     metadata = {"scale": scale, "not_registered": missing, "camera_models": table}
     return PhotoCalibration(
         photographs=tuple(photographs),
-        rig=_rig(options.take, ids, structure, mapped.tracks, candidates[chosen], metadata),
+        rig=replace(
+            _rig(options.take, ids, structure, mapped.tracks, candidates[chosen], metadata),
+            scale="arbitrary" if options.known_distance is None else "metric",
+        ),
         missing=missing,
         candidates=candidates,
         chosen=chosen,

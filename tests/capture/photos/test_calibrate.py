@@ -137,6 +137,7 @@ def test_the_known_distance_sets_the_scale_and_the_first_photograph_the_frame(ca
     assert np.linalg.norm(last - first) == pytest.approx(true_distance())
     assert first == pytest.approx(0, abs=1e-12)
     assert "view0" in calibration.scale
+    assert calibration.rig.scale == "metric"
     assert not any("arbitrary" in warning for warning in calibration.warnings)
 
 
@@ -185,6 +186,7 @@ def test_masks_and_single_cameras_are_heeded_and_an_arbitrary_scale_is_said(albu
     assert len({camera.camera for camera in result.rig.cameras.values()}) == 3
     said = " ".join(result.warnings)
     assert "arbitrary" in said
+    assert result.rig.scale == "arbitrary"
     assert "only 3 of 8 photographs were registered (not view4.png, wall0.png" in said
     assert "at least four photographs" in said
     depths = result.structure.in_cameras(result.tracks)[:, 2]
