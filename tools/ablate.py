@@ -20,13 +20,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ablation.design import Base, cells_of, five_views, tables, view_sets
+from ablation.design import FULL_PRIOR, Base, Table, cells_of, five_views, tables, view_sets
 from ablation.paper import PAPER
 from ablation.priors import Priors, run_config
 from ablation.running import Ablation, StoppedError
@@ -35,6 +35,7 @@ from preface.cli.output import exit_status, resumable, whole_number
 from preface.cli.usage import UsageError
 from preface.model.fitting.configuration import QUALITIES, check, defaults
 from preface.model.matmul import denormals_flushed, keep_freed_memory
+from preface.model.pretrained import prior_flag
 from preface.model.training.configuration import TrainingConfigError
 from preface.model.training.loop import TrainingError
 from preface.model.training.prior_files import Prior, read_prior
@@ -72,6 +73,8 @@ def prepare(arguments: argparse.Namespace) -> Ablation:
         raise UsageError(f"--only {unknown[0]}: {suggestion(unknown[0], every)}")
     chosen = tuple(every[name] for name in (arguments.only or every))
     cells = tuple(cells_of(chosen, people, arguments.seeds))
+    if any(cell.variant.prior != FULL_PRIOR for cell in cells):
+        _require_training_heads(prior, dataset, every)
     run = run_config(prior.configuration["preset"], arguments.device)
     priors = Priors(prior, dataset, arguments.output / "priors", run)
     ablation = Ablation(
@@ -80,6 +83,22 @@ def prepare(arguments: argparse.Namespace) -> Ablation:
     for cell in cells:
         check(ablation.fit(cell))
     return ablation
+
+
+def _require_training_heads(prior: Prior, dataset: Dataset, every: Mapping[str, Table]) -> None:
+    """Refuse to train smaller priors where their heads are not in the shards, as with `--prior pretrained`.
+
+    Raises:
+        ArtifactError: naming a head that is not there, and the tables that need no other prior.
+    """
+    absent = [name for name in prior.identities if name not in dataset.names]
+    if absent:
+        rest = [n for n, t in every.items() if all(row.variant.prior == FULL_PRIOR for row in t.rows)]
+        problem = (
+            f"'{absent[0]}', whom the prior was trained on, is not there, and smaller priors need them all"
+        )
+        remedy = f"Give the shards that it was trained on, or --only {' '.join(rest)}"
+        raise ArtifactError(dataset.manifest.path, "identities", problem, remedy)
 
 
 def _base(arguments: argparse.Namespace) -> Base:
@@ -143,7 +162,12 @@ def parser() -> argparse.ArgumentParser:
         "ablate.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     found.add_argument("shards", type=Path, help="folder of the shards")
-    found.add_argument("--prior", type=Path, required=True, help="folder of the full prior")
+    found.add_argument(
+        "--prior",
+        type=prior_flag,
+        required=True,
+        help="folder of the full prior; `pretrained` is the one that comes with preface",
+    )
     found.add_argument("--output", type=Path, required=True, help="folder to write, or to go on with")
     found.add_argument("--only", nargs="+", metavar="TABLE", help=f"some of {', '.join(PAPER)}")
     found.add_argument(

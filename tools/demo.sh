@@ -5,19 +5,42 @@
 # on the photographs that were kept away, and shows it all on one page. About ten minutes on two cores, and five for
 # the set-up the first time. Every stage prints the command that it runs. Run again, it resumes where it stopped.
 # Prints the path of the page last.
-#   OUTPUT=DIR   where to put everything (default: demo_output)
+#   --pretrained  start from the prior that comes with preface and train none: one new person is photographed, aligned
+#                 on the prior's template and fitted
+#   OUTPUT=DIR    where to put everything (default: demo_output, or demo_output/pretrained)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
+pretrained=false
+for word in "$@"; do
+    case $word in
+        --pretrained) pretrained=true ;;
+        *)
+            printf "demo.sh: '%s' is not known; usage: [OUTPUT=DIR] bash tools/demo.sh [--pretrained]\n" "$word" >&2
+            exit 2
+            ;;
+    esac
+done
+
 bash tools/setup.sh
 bin=.venv/bin
-out=${OUTPUT:-demo_output}
-people=13 # the last of them is fitted
-fitted=id0012
-mkdir -p "$out"
-
 # Minutes that each stage takes on two cores, for the estimate of what is left.
-minutes=(1.8 0.1 0.5 1.2 0.7 2.2 0.9 0.7 0.4 0.6 0.3)
+if $pretrained; then
+    out=${OUTPUT:-demo_output/pretrained}
+    prior=pretrained
+    # Another seed than that of the studio which the prior was trained in: somebody new.
+    studio=(--identities 1 --takes 1 --seed 2024)
+    fitted=id0000
+    minutes=(0.1 0.5 0.1 0.3 0.2 0.1 1.5 1.2 0.5 1.0 0.1)
+else
+    out=${OUTPUT:-demo_output}
+    prior=$out/prior
+    people=13 # the last of them is fitted
+    studio=(--identities "$people")
+    fitted=id0012
+    minutes=(1.8 0.1 0.5 1.2 0.7 2.2 0.9 0.7 0.4 0.6 0.3)
+fi
+mkdir -p "$out"
 number=0
 
 stage() { # stage NAME command...: says what is left, prints, times and notes down the command
@@ -33,18 +56,31 @@ stage() { # stage NAME command...: says what is left, prints, times and notes do
     printf '== %s took %s s\n' "$name" "$took"
 }
 
+if $pretrained; then
+    stage "prior" $bin/preface-inspect "$prior"
+    size=$($bin/python -c 'import sys; from preface.model.training.prior_files import read_prior
+print("{}x{}".format(*read_prior(sys.argv[1]).scene.resolution))' "$prior")
+    onto=(--template "$prior")
+    holdout=()
+else
+    size=96x144
+    onto=()
+    holdout=(--holdout "$fitted")
+fi
 stage "synthetic studio" $bin/python tools/synthetic_studio --output "$out" \
-    --identities "$people" --views 13 --resolution 256x384 --board.frames 14
+    "${studio[@]}" --views 13 --resolution 256x384 --board.frames 14
 stage "inspection" $bin/preface-inspect "$out/capture"
 stage "calibration" $bin/preface-calibrate board "$out/capture" --output "$out"
-stage "alignment" $bin/preface-align studio "$out/capture" --rig "$out" --output "$out/alignment"
+stage "alignment" $bin/preface-align studio "$out/capture" --rig "$out" "${onto[@]}" --output "$out/alignment"
 stage "shards" $bin/preface-build-shards "$out/capture" --rig "$out" --alignment "$out/alignment" \
-    --output "$out/shards" --resolution 96x144 --holdout "$fitted"
-stage "prior" $bin/preface-train "$out/shards" --preset tiny --identities $((people - 1)) --output "$out/prior"
-stage "fit" $bin/preface-fit "$out/shards" --prior "$out/prior" --identity "$fitted" --views cam04 cam05 \
+    --output "$out/shards" --resolution "$size" "${holdout[@]}"
+if ! $pretrained; then
+    stage "prior" $bin/preface-train "$out/shards" --preset tiny --identities $((people - 1)) --output "$prior"
+fi
+stage "fit" $bin/preface-fit "$out/shards" --prior "$prior" --identity "$fitted" --views cam04 cam05 \
     --quality draft --output "$out/head"
 # The same architecture for as many steps, inversion's among them.
-stage "fit without a prior" $bin/preface-fit "$out/shards" --prior none --like "$out/prior" --identity "$fitted" \
+stage "fit without a prior" $bin/preface-fit "$out/shards" --prior none --like "$prior" --identity "$fitted" \
     --views cam04 cam05 --quality draft --finetuning.steps 240 --output "$out/head-without-prior"
 stage "orbit" $bin/preface-render "$out/head" --orbit 24 --video --no-exr --output "$out/renders"
 stage "evaluation" $bin/preface-evaluate "$out/head" "$out/head-without-prior" --shards "$out/shards" \

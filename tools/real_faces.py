@@ -1,7 +1,7 @@
 """Real faces, end to end: heads from few photographs, with and without the prior, on views that were kept away.
 
-    python tools/real_faces.py walk-around FOLDER --prior prior --output real/person
-    python tools/real_faces.py studio FOLDER --prior prior --output real/studio --squares 9x6 --square-size 0.010
+    python tools/real_faces.py walk-around FOLDER --output real/person
+    python tools/real_faces.py studio FOLDER --output real/studio --squares 9x6 --square-size 0.010
 
 `walk-around` takes the pictures of one person by one moving camera: `images/`, a COLMAP model in `sparse/0`, and
 perhaps masks in `matte/`, which only measure ours. Heads are fitted to 2, 3, 5 and 7 of the pictures, spread over the
@@ -50,10 +50,10 @@ class RealFaces:
     """How FOLDER is laid out."""
     folder: tyro.conf.Positional[Path]
     """The photographs."""
-    prior: Path
-    """Folder of the prior, with template.json."""
     output: Path
     """Where everything is written."""
+    prior: Literal["pretrained"] | Path = "pretrained"
+    """Folder of the prior, with template.json; `pretrained` is the one that comes with preface."""
     quality: Literal["draft", "balanced", "reference"] = "draft"
     """Of the fits."""
     resolution: str = "144x216"
@@ -102,7 +102,8 @@ def _walk_around(config: RealFaces) -> list[Row]:
     work = config.output
     rig = work / "rig.json"
     if not rig.exists():
-        _run("preface-calibrate", "import", config.folder / "sparse" / "0", "--output", rig)
+        model = config.folder / "sparse" / "0"
+        _run("preface-calibrate", "import", model, "--scale", "arbitrary", "--output", rig)
     pictures = {file.stem: file for file in sorted((config.folder / "images").iterdir())}
     subject = work / "capture" / "subjects" / PERSON
     _copy(pictures, subject)
@@ -113,7 +114,7 @@ def _walk_around(config: RealFaces) -> list[Row]:
     rows = []
     for count in config.counts:
         views = _spread(most, count)
-        for how, prior in (("prior", config.prior), ("none", Path("none"))):
+        for how, prior in (("prior", config.prior), ("none", "none")):
             head = _fit(config, shards, prior, PERSON, views, work / f"heads/{count}-{how}")
             rows.append(Row(config.folder.name, count, how, _measured(head, shards, away)))
         if config.one_command and count > 1:
@@ -213,7 +214,7 @@ def _studio(config: RealFaces) -> list[Row]:
     for person in people:
         for away in cameras:
             views = [camera for camera in cameras if camera != away]
-            for how, prior in (("prior", config.prior), ("none", Path("none"))):
+            for how, prior in (("prior", config.prior), ("none", "none")):
                 head = _fit(
                     config,
                     shards,
@@ -240,7 +241,9 @@ def _shards(config: RealFaces, source: Path, rig: Path) -> Path:
     return shards
 
 
-def _fit(config: RealFaces, shards: Path, prior: Path, person: str, views: Sequence[str], head: Path) -> Path:
+def _fit(
+    config: RealFaces, shards: Path, prior: str | Path, person: str, views: Sequence[str], head: Path
+) -> Path:
     """Fit a head; without a prior, one with the prior's architecture, and inversion's steps are finetuning's."""
     start: list[object] = ["--prior", prior]
     inversion, finetuning, _ = defaults(config.quality)
@@ -256,7 +259,8 @@ def _fit(config: RealFaces, shards: Path, prior: Path, person: str, views: Seque
 def _measured(head: Path, shards: Path, views: Sequence[str]) -> Path:
     """The metrics.json of a head on some views."""
     output = head.parent / f"{head.name}-measured"
-    _run("preface-evaluate", head, "--shards", shards, "--views", *views, "--output", output)
+    where = ["--shards", shards, "--views", *views, "--output", output]
+    _run("preface-evaluate", head, *where, "--no-normals")  # figures are what the table has
     return output / head.name / "metrics.json"
 
 

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import tyro
 
-from preface.artifacts import ArtifactError, load_json, provenance
+from preface.artifacts import ArtifactError, load_json, provenance, sha256
 from preface.capture.images import read_image
-from preface.model.training.prior_files import read_prior
+from preface.model.pretrained import pretrained_folder
+from preface.model.training.prior_files import MODEL_FILE, read_prior
 from preface.reports import KeyFigure, Link, Report, Section, contact_sheet
 from preface.reports.pictures import Picture, as_picture
 from preface.shards import Dataset
@@ -73,7 +74,7 @@ def build_report(folder: Path) -> Report:
     metrics = {name: load_json(folder / "evaluation" / name / "metrics.json") for name in names}
     inputs = {f"{name}/metrics.json": folder / "evaluation" / name / "metrics.json" for name in names}
     report = Report("A head from two photographs", provenance({}, inputs))
-    _show_result(report.section("Result"), fit, metrics)
+    _show_result(report.section("Result"), fit, metrics, prior_words(folder, fit))
     _show_inputs(report.section("What was given"), folder, fit)
     for name, heading in ((HEAD, "Views that were kept away"), (BASELINE, "The same fit without a prior")):
         _show_sheet(report.section(heading), folder / "evaluation" / name, name)
@@ -82,13 +83,36 @@ def build_report(folder: Path) -> Report:
     return report
 
 
-def _show_result(section: Section, fit: Mapping[str, Any], metrics: Mapping[str, Mapping[str, Any]]) -> None:
+def prior_words(folder: Path, fit: Mapping[str, Any]) -> str:
+    """Which prior a head was fitted from, as a sentence.
+
+    Raises:
+        ArtifactError: neither the one that was trained here nor the one that comes with preface.
+    """
+    if (folder / "prior" / MODEL_FILE).exists():
+        path, whence = folder / "prior", "was trained here"
+    else:
+        path, whence = pretrained_folder(), "is the one that comes with preface, trained"
+    prior = read_prior(path)
+    if sha256(prior.path) != fit["prior"]:
+        problem = f"is not that of {prior.path}"
+        raise ArtifactError(
+            folder / HEAD, "fit.prior", problem, "Delete the folder, and run tools/demo.sh again"
+        )
+    return (
+        f"The prior {whence} on {len(prior.identities)} people who do not exist, for {prior.steps:,} steps."
+    )
+
+
+def _show_result(
+    section: Section, fit: Mapping[str, Any], metrics: Mapping[str, Mapping[str, Any]], prior: str
+) -> None:
     count, views = len(fit["views"]), len(metrics[HEAD]["views"])
     section.text(
         f"""{fit["identity"]} is nobody that the prior was trained on. Its head was fitted to {count} photographs
         ({", ".join(fit["views"])}) and is measured here on {views} others, beside a model of the same architecture
-        that was trained on the same photographs for as many steps, but from random weights. Both are small and were
-        trained for minutes; more people, more steps and more pixels are what the commands below are for."""
+        that was trained on the same photographs for as many steps, but from random weights. {prior} Both models are
+        small; more people, more steps and more pixels are what the commands below are for."""
     )
     means = {name: metrics[name]["mean"] for name in metrics}
     shown = {key: value for key, value in FIGURES.items() if all(key in mean for mean in means.values())}
@@ -176,6 +200,7 @@ def _show_stages(section: Section, folder: Path) -> None:
     section.text("Each stage has a report or pictures of its own:")
     reports = {
         "The studio, its people and the truth about them": "studio.html",
+        "Cameras": "rig.report.html",
         "Cameras of take 0": "rigs/take00.report.html",
         "Cameras of take 1": "rigs/take01.report.html",
         "Alignment": "alignment/report.html",

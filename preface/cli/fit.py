@@ -18,6 +18,7 @@ import tyro
 
 from preface.artifacts import ArtifactError
 from preface.cli.output import print_lines, say
+from preface.cli.typed_flags import parse_flags
 from preface.cli.usage import UsageError
 from preface.model.configuration import ConfigurationError
 from preface.model.fitting.configuration import QUALITIES, FitConfig, defaults
@@ -97,7 +98,7 @@ def parse(arguments: Sequence[str]) -> FitCommand:
     default = FitCommand(
         shards=tyro.MISSING, quality=quality, inversion=inversion, finetuning=finetuning, run=run
     )
-    return tyro.cli(FitCommand, prog="preface-fit", args=list(arguments), default=default)
+    return parse_flags(FitCommand, "preface-fit", arguments, default)
 
 
 def is_shards(path: Path) -> bool:

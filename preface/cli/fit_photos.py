@@ -22,7 +22,7 @@ import numpy as np
 from preface.align.alignment_files import INDEX_FILE, TEMPLATE_FILE, read_index, write_template
 from preface.align.photos.face import face_prior, keypoint_weights
 from preface.align.template import Template, canonical_frame
-from preface.artifacts import ArtifactError, provenance, sha256
+from preface.artifacts import ArtifactError, provenance, sha256, write_bytes
 from preface.capture.images import IMAGE_SUFFIXES
 from preface.capture.upright import read_upright_header
 from preface.cli import align, build_shards
@@ -31,6 +31,7 @@ from preface.cli.fit import FitCommand
 from preface.cli.output import size
 from preface.cli.usage import UsageError
 from preface.model.fitting.configuration import MAX_VIEWS
+from preface.model.pretrained import PRETRAINED
 from preface.model.training.prior_files import Prior, read_prior
 from preface.plain_words import suggestion
 from preface.shards.dataset.people import is_capture
@@ -79,7 +80,7 @@ def prepare(command: FitCommand, say: Say) -> Prepared:
         StageError: a stage found something wrong.
     """
     files = photographs(command.shards, command.views)
-    prior = read_prior(command.prior) if isinstance(command.prior, Path) else None
+    prior = read_prior(command.prior) if command.from_prior else None
     resolution = view_size(command, prior, files)
     folder = command.output / FOLDER
     alignment, shards = folder / "alignment", folder / "shards"
@@ -108,7 +109,7 @@ def explain(prepared: Prepared, command: FitCommand, say: Say) -> None:
     """Say how far a head can be trusted, and write it down beside the shards."""
     from preface.cli.fit_trust import trust
 
-    found = trust(prepared.alignment, prepared.shards, command.prior != "none")
+    found = trust(prepared.alignment, prepared.shards, command.from_prior)
     say("How far to trust it:")
     for sentence in found.sentences:
         say(f"    {sentence}")
@@ -174,12 +175,21 @@ def _template(command: FitCommand, prior: Prior | None, folder: Path, say: Say) 
     if prior is not None:
         beside = prior.path.parent / TEMPLATE_FILE
         if beside.exists():
-            return beside
+            # A copy of the one that comes with preface: what is printed and recorded holds wherever that is installed.
+            return beside if command.prior != PRETRAINED else _copied(beside, folder / TEMPLATE_FILE)
         say(
             f"note: there is no {TEMPLATE_FILE} beside the prior. The face is placed on the expected one, which "
             "may lie some millimetres from where the prior has its faces; --photos.template names the right one"
         )
     return write_template(folder / TEMPLATE_FILE, expected_template())
+
+
+def _copied(file: Path, target: Path) -> Path:
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise ArtifactError.from_os(file, "reading", error) from error
+    return write_bytes(target, content)
 
 
 def expected_template() -> Template:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from preface.artifacts import ArtifactError, load_json, read_artifact
+from preface.model.pretrained import prior_flag, prior_path
 from preface.plain_words import shown, suggestion
 
 if TYPE_CHECKING:  # these need numpy; --help must not wait for it
@@ -23,7 +24,8 @@ _DESCRIPTION = (
 )
 _EPILOG = "Exit status: 0 when all is well, 1 when something is wrong, 2 for wrong usage."
 _PATH_HELP = (
-    "an artefact, or a folder of a capture, a rig, an alignment, shards, a prior, a head or its figures"
+    "an artefact, or a folder of a capture, a rig, an alignment, shards, a prior, a head or its figures; `pretrained` "
+    "is the prior that comes with preface"
 )
 MAX_LISTED = 20  # problems and missing views beyond this are counted; --json lists them all
 
@@ -62,7 +64,7 @@ class Report:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit status."""
     parser = ArgumentParser("preface-inspect", description=_DESCRIPTION, epilog=_EPILOG)
-    parser.add_argument("paths", metavar="PATH", nargs="+", type=Path, help=_PATH_HELP)
+    parser.add_argument("paths", metavar="PATH", nargs="+", type=prior_flag, help=_PATH_HELP)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     config = parser.parse_args(arguments)
     reports = [report for path in config.paths for report in inspect(path)]
@@ -79,14 +81,14 @@ def main(arguments: list[str] | None = None) -> int:
     return status
 
 
-def inspect(path: Path) -> list[Report]:
-    """Inspect one artefact, or all those of a folder."""
+def inspect(path: str | Path) -> list[Report]:
+    """Inspect one artefact, or all those of a folder; the text `pretrained` is the prior that comes with preface."""
     try:
-        return [_inspect_artifact(report) for report in _artifacts(path)]
+        return [_inspect_artifact(report) for report in _artifacts(prior_path(path))]
     except ArtifactError as error:
-        return [Report(path, problems=[error])]
+        return [Report(Path(path), problems=[error])]
     except OSError as error:
-        return [Report(path, problems=[ArtifactError.from_os(path, "file", error)])]
+        return [Report(Path(path), problems=[ArtifactError.from_os(path, "file", error)])]
 
 
 def _artifacts(path: Path) -> list[Report]:

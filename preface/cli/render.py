@@ -12,6 +12,7 @@ from pathlib import Path
 
 from preface.cli.output import exit_status, size, whole_number
 from preface.cli.render_shortcuts import add_quality_flags
+from preface.model.pretrained import prior_flag
 
 _DESCRIPTION = "Render what a model knows of a head: colour, opacity, depth and normals."
 _EPILOG = "Exit status: 0 when everything was written, 1 when something is wrong, 2 for wrong usage."
@@ -29,7 +30,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("preface-render", description=_DESCRIPTION, epilog=_EPILOG)
-    parser.add_argument("model", type=Path, help="folder of a prior or a head, or its model.json")
+    parser.add_argument(
+        "model",
+        type=prior_flag,
+        help="folder of a prior or a head, or its model.json; `pretrained` is the prior that comes with preface",
+    )
     parser.add_argument("--output", type=Path, required=True, help="folder for the images, made if absent")
     who = parser.add_argument_group("who")
     who.add_argument("--identity", help="whose code to render; may be left out if there is only one")

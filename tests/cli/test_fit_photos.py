@@ -156,8 +156,9 @@ def test_shards_get_the_box_of_the_prior_to_the_last_bit(person, monkeypatch, tm
     monkeypatch.setattr(
         "preface.cli.align.main", lambda given: seen.setdefault("align", given) and 1
     )  # and stop there
+    command = parse([str(person), "--prior", str(tmp_path / "prior"), "--output", str(tmp_path / "head")])
     with pytest.raises(Exception, match="exit status 1"):
-        prepare(parse([str(person), "--output", str(tmp_path / "head")]), lambda _: None)
+        prepare(command, lambda _: None)
     assert seen["align"][seen["align"].index("--template") + 1] == str(template)
     from preface.cli.fit_photos import _shards_words
 

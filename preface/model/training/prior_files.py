@@ -19,6 +19,7 @@ import numpy as np
 
 from preface.artifacts import ArtifactError, read_artifact
 from preface.model.configuration import ConfigurationError, ModelConfig
+from preface.model.pretrained import prior_path
 
 if TYPE_CHECKING:
     from preface.model.model import PriorModel
@@ -129,12 +130,14 @@ def prior_payload(prior: Prior) -> dict[str, Any]:
 
 
 def read_prior(path: str | os.PathLike[str]) -> Prior:
-    """Read ``model.json``, or that of a folder.
+    """Read ``model.json``, or that of a folder, or for the text `pretrained` that of the prior that comes with preface.
 
     Raises:
-        ArtifactError: unreadable, of another schema or architecture, or with fields that cannot be.
+        ArtifactError: unreadable, of another schema or architecture, or with fields that cannot be; `pretrained` in an
+            installation that is without it.
     """
-    path = Path(path) / MODEL_FILE if Path(path).is_dir() else Path(path)
+    path = prior_path(path)
+    path = path / MODEL_FILE if path.is_dir() else path
     content = read_artifact(path, SCHEMA)
     if content["architecture"] != ARCHITECTURE:
         problem = f"is '{content['architecture']}', and this preface knows '{ARCHITECTURE}'"

@@ -1,11 +1,14 @@
 """Runs that take a second or two."""
 
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import safetensors.torch
 import torch
 
+from preface.artifacts import SCHEMA_DIRECTORY
 from preface.model.configuration import ModelConfig, NetworkConfig
 from preface.model.training.configuration import RunConfig, TrainConfig, TrainingConfig
 
@@ -54,3 +57,12 @@ def assert_equal_bits(one, other) -> None:
     assert one.keys() == other.keys()
     for name, value in one.items():
         assert value.numpy().tobytes() == other[name].numpy().tobytes(), name
+
+
+def words_of_log(path):
+    """The kinds of a log's lines, and the words in them that data_specs/log.md does not have."""
+    described = set(re.findall(r"`(\w+)`", (SCHEMA_DIRECTORY / "log.md").read_text()))
+    entries = [json.loads(line) for line in path.read_text().splitlines()]
+    kinds = {entry["kind"] for entry in entries}
+    groups = {name for entry in entries for key in ("gradient_norm", "rate") for name in entry.get(key, ())}
+    return kinds, {*kinds, *groups, *(key for entry in entries for key in entry)} - described

@@ -15,7 +15,7 @@ import pytest
 import safetensors.torch
 import small_runs
 import torch
-from small_runs import assert_equal_bits, config, quiet, tensors
+from small_runs import assert_equal_bits, config, quiet, tensors, words_of_log
 
 from preface.artifacts import ArtifactError
 from preface.model.rays import Rays
@@ -151,6 +151,12 @@ def test_a_run_that_is_stopped_while_it_is_looked_at_has_nothing_to_train_again(
     assert train_prior(here, quiet).status == 0
     assert psnr(tmp_path / "prior") == psnr(straight)
     assert_equal_bits(tensors(tmp_path / "prior"), tensors(straight))
+
+
+def test_the_page_of_logs_describes_every_value_of_every_line(straight):
+    kinds, undescribed = words_of_log(straight / "log.jsonl")
+    assert kinds == {"train", "validation"}
+    assert undescribed == set()
 
 
 def test_the_checkpoint_describes_what_was_trained(balls, straight):

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from pathlib import Path
 
 import ball_heads
 import numpy as np
@@ -156,3 +157,14 @@ def test_half_the_resolution_sees_the_same_with_a_quarter_of_the_pixels(shards, 
             mask = dataset.pixels(2, 3)[..., 3].astype(float)
             means = mask.reshape(16, 2, 12, 2).mean(axis=(1, 3))
             np.testing.assert_allclose(half.pixels(1, 3)[..., 3], means, atol=0.51)
+
+
+def test_smaller_priors_need_the_people_of_the_full_one(shards, tmp_path, capsys, monkeypatch):
+    monkeypatch.syspath_prepend(Path(small_runs.__file__).parents[1] / "evaluation")
+    from untrained import write_model
+
+    strangers = write_model(tmp_path / "prior", ["somebody", "else"])
+    assert run(shards, strangers, tmp_path / "out", *CHOICE, *CHEAP, "--plan") == 1
+    said = capsys.readouterr().err
+    assert "'somebody', whom the prior was trained on, is not there" in said
+    assert "--only initialisation regularisers views frozen-latent" in said

@@ -1,14 +1,18 @@
 """The main job from shards on, by its commands: a prior, a head from two views, its orbit, its figures, the page."""
 
 import json
+import shutil
+import subprocess
+from pathlib import Path
 
 import ball_heads
 import pytest
 import small_runs
 
 import show_demo
-from preface.artifacts import read_artifact
+from preface.artifacts import read_artifact, sha256
 from preface.cli import evaluate, fit, inspect, render
+from preface.model import pretrained
 from preface.model.training.prior import train_prior
 
 UNSEEN, VIEWS = "id0003", ["camera1", "camera4"]
@@ -75,6 +79,27 @@ def test_the_page_shows_both_heads_the_orbit_and_every_command_once(made, capsys
     assert {"evaluation/report.html", "renders"} <= {
         link["path"] for link in blocks(page, "links")[0]["links"]
     }
+
+
+def test_the_page_says_which_prior_was_used(made, tmp_path, monkeypatch):
+    fit = {"prior": sha256(made / "prior" / "model.json")}
+    assert "was trained here on 3 people" in show_demo.prior_words(made, fit)
+    box = tmp_path / "box"
+    shutil.copytree(made / "prior", box)
+    for name in ("template.json", "MODEL_CARD.md"):
+        (box / name).write_text("{}")
+    monkeypatch.setattr(pretrained, "FOLDER", box)
+    assert "is the one that comes with preface, trained on 3 people" in show_demo.prior_words(tmp_path, fit)
+    with pytest.raises(show_demo.ArtifactError, match="is not that of"):
+        show_demo.prior_words(tmp_path, {"prior": "0" * 64})
+
+
+def test_the_demo_refuses_what_it_does_not_know_before_it_does_anything():
+    script = Path(show_demo.__file__).with_name("demo.sh")
+    run = subprocess.run(["bash", script, "--pretained"], capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stdout) == (2, "")
+    assert "'--pretained' is not known" in run.stderr
+    assert "--pretrained" in run.stderr
 
 
 def test_what_is_missing_is_named(made, tmp_path, capsys):
