@@ -11,6 +11,7 @@ from pathlib import Path
 
 from preface.cli.output import exit_status, whole_number
 from preface.model.evaluation.options import FACE_HALF_SIDE, LPIPS_CHOICES
+from preface.model.pretrained import prior_flag
 from preface.model.rendering.shortcuts import QUALITIES
 
 _DESCRIPTION = (
@@ -34,7 +35,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("preface-evaluate", description=_DESCRIPTION, epilog=_EPILOG)
-    parser.add_argument("heads", type=Path, nargs="+", metavar="HEAD", help="folder of a head, or of a prior")
+    parser.add_argument(
+        "heads",
+        type=prior_flag,
+        nargs="+",
+        metavar="HEAD",
+        help="folder of a head, or of a prior; `pretrained` is the prior that comes with preface",
+    )
     parser.add_argument("--shards", type=Path, required=True, help="with the photographs, at any resolution")
     parser.add_argument("--output", type=Path, required=True, help="folder, made if absent")
     what = parser.add_argument_group("of what")
@@ -68,6 +75,13 @@ def _parser() -> argparse.ArgumentParser:
         choices=tuple(QUALITIES),
         default="reference",
         help="shortcuts of rendering (default: reference, none, so that figures are the head's and not theirs)",
+    )
+    speed.add_argument(
+        "--normals",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="show normals on the sheets; no figure depends on them, and without them rendering takes some six tenths "
+        "of the time (default: shown)",
     )
     speed.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
     speed.add_argument(

@@ -28,6 +28,7 @@ from preface.model.evaluation.views import (
     require_same_space,
 )
 from preface.model.matmul import denormals_flushed, keep_freed_memory
+from preface.model.pretrained import prior_path
 from preface.model.training.prior_files import Prior, read_prior
 from preface.reports.pictures import as_picture, colorize
 from preface.shards import Dataset
@@ -52,6 +53,7 @@ def run(config: argparse.Namespace) -> list[str]:
         lpips=config.lpips,
         face_half_side=config.face_half_side,
         quality=config.quality,
+        normals=config.normals,
         rays_at_a_time=config.rays_at_a_time,
         device=config.device,
     )
@@ -101,13 +103,14 @@ def _jobs(config: argparse.Namespace, dataset: Dataset) -> list[Job]:
     return jobs
 
 
-def _names(heads: Sequence[Path]) -> list[str]:
+def _names(heads: Sequence[str | Path]) -> list[str]:
     """The names of heads: of their folders, with as many of those above as it takes to tell them apart.
 
     Raises:
         ArtifactError: one head is given twice.
     """
-    folders = [head.resolve() if head.is_dir() else head.resolve().parent for head in heads]
+    paths = [prior_path(head) for head in heads]
+    folders = [path.resolve() if path.is_dir() else path.resolve().parent for path in paths]
     for number, folder in enumerate(folders):
         if folder in folders[:number]:
             raise ArtifactError(heads[number], "HEAD", "is given twice", "Name each head once")

@@ -67,6 +67,17 @@ def test_heads_side_by_side_leave_figures_tables_pictures_and_a_page(models, sha
     assert report.summary["kind"] == "head"
 
 
+def test_normals_are_left_out_when_they_are_not_wanted_and_no_figure_changes(models, shards, tmp_path):
+    common = [str(models / "prior"), "--shards", str(shards), "--identity", "id0001", "--lpips", "none"]
+    assert main([*common, "--output", str(tmp_path / "shown")]) == 0
+    assert main([*common, "--output", str(tmp_path / "plain"), "--no-normals"]) == 0
+    shown, plain = (read_metrics(tmp_path / name / "prior") for name in ("shown", "plain"))
+    assert shown["views"] == plain["views"]
+    assert shown["settings"] == plain["settings"]
+    pages = [(tmp_path / name / "report.json").read_text() for name in ("shown", "plain")]
+    assert ["normals in the canonical frame" in page for page in pages] == [True, False]
+
+
 def test_a_prior_is_evaluated_at_the_view_that_it_held_out_and_images_are_kept_when_asked_for(
     models, shards, tmp_path
 ):

@@ -58,7 +58,7 @@ class Ablation:
     priors: Priors
     output: Path
 
-    options = EvaluationOptions()
+    options = EvaluationOptions(normals=False)
 
     def fit(self, cell: Cell) -> FitConfig:
         """The fit of a cell."""

@@ -74,7 +74,7 @@ class EvaluatedView:
         truth, rgb: float32 [H, W, 3] in [0, 1], sRGB-encoded, on black.
         mask, alpha: float32 [H, W], the photograph's foreground and the render's opacity.
         depth: float32 [H, W], metres along the camera's axis, NaN where the model is transparent.
-        normals: float32 [H, W, 3], canonical frame, of length one or NaN.
+        normals: float32 [H, W, 3], canonical frame, of length one or NaN; None where they were not asked for.
     """
 
     figures: ViewFigures
@@ -83,7 +83,7 @@ class EvaluatedView:
     mask: np.ndarray
     alpha: np.ndarray
     depth: np.ndarray
-    normals: np.ndarray
+    normals: np.ndarray | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,8 @@ def evaluate_views(
     require_same_space(prior, dataset)
     model = prior.load_model().to(options.device)
     space = space_of(prior)
-    render = head_renderer(model, prior.identities.index(identity), space, QUALITIES[options.quality])
+    row, shortcuts = prior.identities.index(identity), QUALITIES[options.quality]
+    render = head_renderer(model, row, space, shortcuts, normals=options.normals)
     seen = {name: standing_camera(dataset, identity, name) for name in _seen(prior, dataset, identity)}
     for name in views:
         standing = standing_camera(dataset, identity, name)
@@ -163,13 +164,15 @@ def evaluate_views(
             ) from error
         truth, mask = photograph_on_black(dataset, identity, name)
         masked = model.config.background == "modelled"
-        yield _compared(measure, standing, image, truth, mask, seen, options.face_half_side, masked=masked)
+        yield _compared(measure, standing, image, truth, mask, seen, options, masked=masked)
 
 
-def head_renderer(model: PriorModel, row: int, space: Space, shortcuts: Shortcuts) -> RenderRays:
-    """What renders rays with the code of a row on black, with normals, and without gradients."""
+def head_renderer(
+    model: PriorModel, row: int, space: Space, shortcuts: Shortcuts, *, normals: bool = True
+) -> RenderRays:
+    """What renders rays with the code of a row on black, without gradients, and with normals if they are wanted."""
     code = model.codes[row].detach() if model.config.latent else None
-    return accelerate(model, code, space, shortcuts, normals=True)
+    return accelerate(model, code, space, shortcuts, normals=normals)
 
 
 def photograph_on_black(dataset: Dataset, identity: str, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -197,13 +200,13 @@ def _compared(
     truth: np.ndarray,
     mask: np.ndarray,
     seen: Mapping[str, StandingCamera],
-    half_side: float,
+    options: EvaluationOptions,
     *,
     masked: bool,
 ) -> EvaluatedView:
     rgb = np.clip(image.rgb, 0.0, 1.0)
     rgb = rgb * mask[..., None] if masked else rgb
-    square = face_square(standing, half_side)
+    square = face_square(standing, options.face_half_side)
     whole = measure.whole(rgb, truth, image.alpha, mask)
     face = measure.no_face() if square is None else measure.pair(square.of(rgb), square.of(truth))
     both = (*_named(whole, ""), *_named(face, "_face"))
@@ -218,8 +221,9 @@ def _compared(
         face=square,
         canonical_from_camera=pose,
     )
-    # A head of which a renderer found nothing has no normals either.
-    normals = np.full_like(rgb, np.nan) if image.normals is None else image.normals
+    normals = None
+    if options.normals:  # a head of which a renderer found nothing has none either
+        normals = np.full_like(rgb, np.nan) if image.normals is None else image.normals
     return EvaluatedView(figures, truth, rgb, mask, image.alpha, image.depth, normals)
 
 

@@ -25,6 +25,8 @@ class EvaluationOptions:
     quality: str = "reference"
     """Shortcuts of rendering, by name (`preface.model.rendering.shortcuts`); `reference` has none, so that figures are
     the head's and not the renderer's."""
+    normals: bool = True
+    """Also find normals, to be shown. They take the density's derivative, and no figure depends on them."""
     rays_at_a_time: int = 4096
     """Rays that are rendered together; memory goes with it."""
     device: str = "cpu"

@@ -193,12 +193,13 @@ def _head(section: Section, head: HeadResult) -> None:
             f"The face of {measured.identity} in each view, photograph beside render and error.",
             "jpeg",
         )
+    normals = any(view.normals is not None for view in head.pictures)
+    frame = ", normals in the canonical frame (red to the subject's left, green up, blue out of the face)"
     section.image(
         sheet(head.pictures),
-        f"Whole frames: photograph, render, error, depth ({DEPTH_SHOWN} m before and behind the "
-        "middle of the face, from dark to bright; a checker board where the head is transparent), normals in the "
-        "canonical frame (red to the subject's left, green up, blue out of the face), opacity.",
-        f"All views of {measured.identity} with error, depth, normals and opacity.",
+        f"Whole frames: photograph, render, error, depth ({DEPTH_SHOWN} m before and behind the middle of the face, "
+        f"from dark to bright; a checker board where the head is transparent){frame if normals else ''}, opacity.",
+        f"All views of {measured.identity} with error, depth{', normals' if normals else ''} and opacity.",
         "jpeg",
     )
     firsts = []

@@ -31,7 +31,7 @@ class ViewPictures:
     Attributes:
         name: of the camera.
         figures: by name.
-        truth, rgb, error, depth, normals, alpha: of the frame.
+        truth, rgb, error, depth, normals, alpha: of the frame; without normals where none were asked for.
         face_truth, face_rgb, face_error: None where no face is in the image.
     """
 
@@ -41,7 +41,7 @@ class ViewPictures:
     rgb: Picture
     error: Picture
     depth: Picture
-    normals: Picture
+    normals: Picture | None
     alpha: Picture
     face_truth: Picture | None
     face_rgb: Picture | None
@@ -51,7 +51,6 @@ class ViewPictures:
 def view_pictures(view: EvaluatedView) -> ViewPictures:
     """The pictures of a view, reduced by area averaging where it is larger than a tile."""
     error = colorize(np.abs(view.rgb - view.truth).mean(axis=-1), 0, ERROR_SHOWN, "inferno")
-    normals = np.where(np.isnan(view.normals), 0.0, (view.normals + 1) / 2).astype(np.float32)
     square, frames = view.figures.face, (as_picture(view.truth), as_picture(view.rgb), error)
     faces = [None if square is None else _reduced(square.of(frame), FACE_TALLEST) for frame in frames]
     truth, rgb, error = (_reduced(frame, TALLEST) for frame in frames)
@@ -64,7 +63,7 @@ def view_pictures(view: EvaluatedView) -> ViewPictures:
         rgb=rgb,
         error=error,
         depth=_reduced(depth, TALLEST),
-        normals=_reduced(as_picture(normals), TALLEST),
+        normals=None if view.normals is None else _reduced(_shown(view.normals), TALLEST),
         alpha=_reduced(as_picture(view.alpha), TALLEST),
         face_truth=faces[0],
         face_rgb=faces[1],
@@ -73,7 +72,7 @@ def view_pictures(view: EvaluatedView) -> ViewPictures:
 
 
 def sheet(views: Sequence[ViewPictures]) -> Picture:
-    """A row per view: truth, render, error, depth, normals, opacity."""
+    """A row per view: truth, render, error, depth, normals where there are any, opacity."""
     tiles: list[tuple[Picture | None, str]] = []
     for view in views:
         tiles += [
@@ -81,10 +80,10 @@ def sheet(views: Sequence[ViewPictures]) -> Picture:
             (view.rgb, f"{view.figures['psnr']:.2f} dB"),
             (view.error, f"error, 0 to {ERROR_SHOWN}"),
             (view.depth, f"depth, ±{DEPTH_SHOWN} m"),
-            (view.normals, "normals"),
+            *([] if view.normals is None else [(view.normals, "normals")]),
             (view.alpha, "opacity"),
         ]
-    return contact_sheet(tiles, 6, _tile(views[0].truth, SMALLEST))
+    return contact_sheet(tiles, len(tiles) // len(views), _tile(views[0].truth, SMALLEST))
 
 
 def face_sheet(views: Sequence[ViewPictures]) -> Picture | None:
@@ -125,6 +124,11 @@ def input_sheet(photographs: Sequence[tuple[np.ndarray, str]]) -> Picture:
     """The photographs that a head was fitted to, [H, W, 3] on black, with the names of their cameras."""
     tiles = [(_reduced(as_picture(truth), TALLEST), name) for truth, name in photographs]
     return contact_sheet(tiles, 7, _tile(tiles[0][0], SMALLEST))
+
+
+def _shown(normals: np.ndarray) -> Picture:
+    """Normals [H, W, 3] as colours, black where there is none."""
+    return as_picture(np.where(np.isnan(normals), 0.0, (normals + 1) / 2).astype(np.float32))
 
 
 def _reduced(picture: Picture, tallest: int) -> Picture:

@@ -126,6 +126,27 @@ def test_the_angle_to_the_nearest_photograph_that_was_seen(head, dataset):
     assert found.views[1].figures.degrees_from_fitted == 0
 
 
+def test_without_normals_no_density_is_differentiated_and_the_figures_are_the_same(
+    prior, dataset, monkeypatch
+):
+    known, plain = read_prior(prior), EvaluationOptions(lpips="none", normals=False)
+    shown = evaluate_head(known, dataset, "id0001", None, OPTIONS)
+    assert all(view.normals.shape == view.rgb.shape for view in shown.views)
+
+    def refused(*_, **__):
+        raise AssertionError("a derivative was taken")
+
+    monkeypatch.setattr(torch.autograd, "grad", refused)
+    with pytest.raises(AssertionError, match="derivative"):
+        evaluate_head(known, dataset, "id0001", None, OPTIONS)
+    found = evaluate_head(known, dataset, "id0001", None, plain)
+    assert found.mean == shown.mean
+    assert all(view.normals is None for view in found.views)
+    for one, other in zip(found.views, shown.views, strict=True):
+        np.testing.assert_array_equal(one.rgb, other.rgb)
+        np.testing.assert_array_equal(one.depth, other.depth)
+
+
 def test_missing_weights_of_lpips_name_the_command_that_gets_them(prior, dataset, monkeypatch, tmp_path):
     monkeypatch.setenv("PREFACE_CACHE", str(tmp_path))
     with pytest.raises(ArtifactError, match=r"python -m preface\.model\.metrics\.lpips_weights"):

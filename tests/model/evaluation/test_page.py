@@ -81,6 +81,16 @@ def test_large_views_are_reduced_and_small_ones_enlarged_by_whole_factors():
     assert red.sum() == 150 * 200
 
 
+def test_a_sheet_without_normals_has_a_column_less():
+    shown, plain = view_pictures(a_view()), view_pictures(a_view(normals=None))
+    assert sheet([plain, plain]).shape[1] < sheet([shown, shown]).shape[1]
+    # Colours that no other tile has: normals out of the face, and the opacity to their right.
+    for picture, has in ((shown, True), (plain, False)):
+        whole = sheet([picture, picture])
+        assert (whole == [128, 128, 255]).all(axis=-1).any() == has
+        assert (whole == [128, 128, 128]).all(axis=-1).sum() >= 2 * 150 * 200
+
+
 def test_a_view_without_a_face_has_no_tile_on_the_sheet_of_faces():
     with_face, without = view_pictures(a_view()), view_pictures(a_view("cam01", square=None))
     assert face_sheet([without]) is None
