@@ -9,7 +9,8 @@ models, which may differ in width, are measured beside it. Per point: PSNR, SSIM
 PSNR, opacity and depth against the fullest render (128 128 64 samples or twice its own), CPU time per ray and to
 prepare a head, peak memory above that of the loaded model, and operations of matrix products per ray.
 
-`fit` varies steps, rays per step and resolution of `preface-fit`, one at a time.
+`fit` varies steps, rays per step and resolution of `preface-fit`, one at a time; with `--vary quality`, it measures the
+qualities end to end, each fitted and rendered by its own.
 
 OUTPUT/<render or fit>.json has the figures, and the same command goes on where it was interrupted; .png shows the
 fronts, .md the table. Qualities are chosen from the front by the rules in `tradeoff.front`. Let nothing else run.
@@ -26,6 +27,7 @@ from typing import Any
 
 from preface.artifacts import ArtifactError, write_bytes
 from preface.cli.output import exit_status, resumable, say, whole_number
+from preface.model.pretrained import prior_flag
 from preface.model.training.prior_files import read_prior
 from preface.shards import Dataset
 from tradeoff import fitting, report
@@ -43,7 +45,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     render = commands.add_parser("render", help="how heads are rendered")
     render.add_argument("shards", type=Path)
     render.add_argument(
-        "models", type=Path, nargs="+", help="folders of priors or heads; the first is chosen for"
+        "models",
+        type=prior_flag,
+        nargs="+",
+        help="folders of priors or heads, or `pretrained`; the first is chosen for",
     )
     render.add_argument("--people", nargs="+", help="identities (default: the first three of the model)")
     render.add_argument("--views", type=whole_number(1), default=1, help="of each, not seen by the model")

@@ -44,14 +44,14 @@ class Task:
 
     Attributes:
         point: to measure.
-        folder: of the model.
+        folder: of the model, or `pretrained`.
         shards: of the photographs.
         views: identity and camera of each.
         full: folder of the fullest renders; written there if the point is the fullest itself.
     """
 
     point: Point
-    folder: Path
+    folder: str | Path
     shards: Path
     views: tuple[tuple[str, str], ...]
     full: Path

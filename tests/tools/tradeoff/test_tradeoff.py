@@ -1,19 +1,23 @@
 """What is measured and what is chosen from it, on figures made up for the purpose."""
 
 import json
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from measure_tradeoff import _state
 from preface.artifacts import ArtifactError
 from preface.model.configuration import preset
+from preface.model.fitting.configuration import defaults
 from preface.model.rendering.shortcuts import Shortcuts
-from tradeoff.fitting import fits
+from tradeoff.fitting import VARIED, Fit, fits, means, measure
+from tradeoff.fitting import table as fit_table
 from tradeoff.front import chosen, cost, front
 from tradeoff.points import fullest, render_points
 from tradeoff.report import plot, table
@@ -88,7 +92,7 @@ def test_points_differ_and_vary_every_shortcut(small):
 def test_fits_vary_one_thing_at_a_time_and_none_is_longer_than_asked(tmp_path):
     options = SimpleNamespace(
         shards=tmp_path, output=tmp_path / "out", prior=tmp_path / "prior", views=["a", "b"], quality="balanced",
-        resolutions=[], most_steps=500,
+        resolutions=[], most_steps=500, vary=VARIED,
     )  # fmt: skip
     found = list(fits(options, "someone"))
     assert len({fit.config.output for fit in found}) == len(found)
@@ -107,6 +111,27 @@ def test_fits_vary_one_thing_at_a_time_and_none_is_longer_than_asked(tmp_path):
     assert {fit.group for fit in found} == {"as it is", "steps", "inversion", "rays"}
 
 
+def test_qualities_are_fitted_as_they_are_and_rendered_by_their_own(tmp_path):
+    import ball_heads
+
+    ball_heads.write_dataset(tmp_path)
+    options = SimpleNamespace(
+        shards=tmp_path, output=tmp_path / "out", prior=tmp_path / "prior", views=["a", "b"],
+        quality="draft", resolutions=[], most_steps=10**6, vary=["quality"],
+    )  # fmt: skip
+    found = list(fits(options, "someone"))
+    assert [fit.rendered for fit in found] == ["draft", "balanced", "reference"]
+    for fit in found:
+        quality = fit.config.quality
+        assert quality == fit.rendered
+        assert (fit.config.inversion, fit.config.finetuning, fit.config.run) == defaults(quality)
+    assert len({fit.config.output for fit in found}) == 3
+    options.most_steps = found[1].config.finetuning.steps
+    assert [fit.rendered for fit in fits(options, "someone")][:2] == ["draft", "balanced"]
+    options.most_steps = found[0].config.finetuning.steps
+    assert [fit.rendered for fit in fits(options, "someone")] == ["draft"]
+
+
 def test_a_sweep_goes_on_only_with_the_views_that_it_began_with(tmp_path: Path):
     file = tmp_path / "render.json"
     state = _state(file, {"views": [["a", "b"]]})
@@ -115,3 +140,29 @@ def test_a_sweep_goes_on_only_with_the_views_that_it_began_with(tmp_path: Path):
     assert _state(file, {"views": [["a", "b"]]})["points"] == {"x": np.pi}
     with pytest.raises(ArtifactError, match="another sweep"):
         _state(file, {"views": [["a", "c"]]})
+
+
+def test_a_fit_is_measured_at_the_views_that_it_was_not_fitted_to(tmp_path):
+    import ball_heads
+    import small_fits
+
+    ball_heads.write_dataset(tmp_path)
+    with threads(1):
+        config = small_fits.config(tmp_path, "none", tmp_path / "head")
+        found = measure(Fit("steps 8", "steps", config, tmp_path, "reference"))
+        held_out = small_fits.held_out_psnr(tmp_path, tmp_path / "head")
+    assert {"ssim", "lpips", "psnr_face", "cpu_s", "view_cpu_s", "peak_mib"} <= set(found)
+    # A mean of decibels in place of decibels of a mean: near, and not the same.
+    assert found["psnr"] == pytest.approx(held_out, abs=1.0)
+    (row,) = means([{"name": "x", "group": "y", "person": "z", **found}])
+    assert row["view_cpu_s"] == found["view_cpu_s"] > 0
+    assert "| x | 1 |" in fit_table([row])
+
+
+@contextmanager
+def threads(count: int):
+    """The tests' workers use every core already."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    yield
+    torch.set_num_threads(before)
