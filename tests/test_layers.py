@@ -35,7 +35,7 @@ PIPELINE = ("preface.shards.dataset", "preface.shards.export")
 # Nothing of this is needed to print a help, and each costs from a tenth of a second to several.
 HEAVY = (
     *("torch", "cv2", "mediapipe", "open3d", "pycolmap", "scipy", "matplotlib", "numba", "onnxruntime"),
-    *("trimesh", "distributed", "anny"),
+    *("trimesh", "distributed", "anny", "numpy", "jsonschema", "typeguard"),
 )
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 

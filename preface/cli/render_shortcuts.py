@@ -1,11 +1,10 @@
 """``--quality`` and a flag for each shortcut of rendering, for the commands that render."""
 
 import argparse
-import ast
 import dataclasses
-import inspect
 from typing import Any
 
+from preface.cli.field_texts import field_texts
 from preface.cli.usage import UsageError
 from preface.model.rendering.shortcuts import DEFAULT_QUALITY, QUALITIES, Shortcuts
 
@@ -23,9 +22,9 @@ def add_quality_flags(parser: argparse.ArgumentParser) -> None:
         help="reference: everything evaluated as trained; balanced: at least 45 dB to that; draft: to look at "
         "(default: %(default)s)",
     )
-    helps = _field_helps(Shortcuts)
+    texts = field_texts(Shortcuts)
     for field in dataclasses.fields(Shortcuts):
-        name, words = f"--{field.name.replace('_', '-')}", helps[field.name]
+        name, words = f"--{field.name.replace('_', '-')}", texts[field.name].replace("%", "%%")
         if isinstance(field.default, bool):
             group.add_argument(name, action=argparse.BooleanOptionalAction, default=None, help=words)
         elif isinstance(field.default, str):
@@ -49,16 +48,3 @@ def chosen_shortcuts(config: argparse.Namespace) -> Shortcuts:
         return dataclasses.replace(QUALITIES[config.quality], **given)
     except ValueError as error:
         raise UsageError(f"--{str(error).replace('_', '-', 1)}") from error
-
-
-def _field_helps(kind: type) -> dict[str, str]:
-    """The text under each field of a dataclass, in one line."""
-    (body,) = ast.parse(inspect.getsource(kind)).body
-    assert isinstance(body, ast.ClassDef)
-    helps = {}
-    for field, text in zip(body.body, body.body[1:], strict=False):
-        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-            assert isinstance(field.target, ast.Name)
-            assert isinstance(text.value, ast.Constant)
-            helps[field.target.id] = " ".join(str(text.value.value).split()).replace("%", "%%")
-    return helps

@@ -14,6 +14,7 @@ import tyro
 
 from preface.artifacts import ArtifactError
 from preface.cli.output import print_lines, say
+from preface.cli.typed_flags import parse_flags
 from preface.model.configuration import ConfigurationError
 from preface.model.training.configuration import (
     TRAINING_PRESETS,
@@ -54,7 +55,7 @@ def parse(arguments: Sequence[str]) -> TrainConfig:
     # An unknown name is refused below, with the names that there are.
     training, run, model = defaults(name if name in TRAINING_PRESETS else DEFAULT_PRESET)
     default = TrainConfig(shards=tyro.MISSING, training=training, run=run, model=model)
-    return tyro.cli(TrainConfig, prog="preface-train", args=list(arguments), default=default)
+    return parse_flags(TrainConfig, "preface-train", arguments, default)
 
 
 def _complain(message: str, status: int) -> int:

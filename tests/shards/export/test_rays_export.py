@@ -1,13 +1,14 @@
 """Explicit rays against the slow and obvious ones of `preface.geometry`, in float64."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 import small_heads
 from safetensors import safe_open
 
-from preface.artifacts import ArtifactError
+from preface.artifacts import SCHEMA_DIRECTORY, ArtifactError
 from preface.geometry import Box, Views, cast_rays, pixel_centers
 from preface.shards import Dataset
 from preface.shards.export import rays as rays_module
@@ -68,6 +69,18 @@ def test_the_size_that_is_stated_is_the_size_that_is_written(folder, tmp_path):
     size = sum(path.stat().st_size for path in paths)
     assert rays_bytes(chosen) - 4096 * len(paths) < size <= rays_bytes(chosen)
     assert BYTES_PER_RAY == 68
+
+
+def test_the_page_describes_every_tensor_and_every_text_of_a_file(folder, tmp_path):
+    _, paths = exported(folder, tmp_path / "out")
+    found, metadata = tensors(paths[0])
+    of_tensors, of_texts = (SCHEMA_DIRECTORY / "rays.md").read_text().split("\nThe file's metadata")
+    rows = re.findall(r"^\| (`[^|]+`) \| \[V, H, W, (\d)\] \|", of_tensors, re.MULTILINE)
+    described = {name: int(columns) for names, columns in rows for name in re.findall(r"\w+", names)}
+    assert described == {name: tensor.shape[-1] for name, tensor in found.items()}
+    assert {str(tensor.dtype) for tensor in found.values()} == {"float32"}
+    assert set(re.findall(r"^\| `(\w+)` \|", of_texts, re.MULTILINE)) == set(metadata)
+    assert metadata["format"] in of_texts
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """A nerfstudio folder, read by a reader that knows nothing of preface, against the shards' own rays."""
 
+import json
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +10,7 @@ import numpy as np
 import pytest
 import small_heads
 
-from preface.artifacts import ArtifactError, provenance
+from preface.artifacts import SCHEMA_DIRECTORY, ArtifactError, provenance
 from preface.geometry import Camera, Rigid, Views
 from preface.shards import Dataset, Loader, Pick
 from preface.shards.building import build_manifest
@@ -130,3 +132,15 @@ def test_a_third_radial_coefficient_survives(tmp_path):
         expected, valid = camera.project((points - matrix[:, 3]) @ matrix[:, :3])
         assert valid.all()
         assert np.abs(nerfstudio_reader.projected(frame, points) - expected).max() < 1e-9
+
+
+def test_the_page_s_example_has_the_keys_of_a_real_folder_and_describes_them(folder, tmp_path):
+    page = (SCHEMA_DIRECTORY / "transforms.md").read_text()
+    example = json.loads(page.split("```json")[1].split("```")[0])
+    _, (path, *_) = exported(folder, tmp_path / "out", images="rgb")
+    _, content = nerfstudio_reader.frames(path.parent)
+    assert list(example) == list(content)
+    assert list(example["preface"]) == list(content["preface"])
+    assert {*example["frames"][0], "mask_path"} == {*content["frames"][0]}
+    named = {*content, *content["frames"][0], *content["preface"]}
+    assert named <= set(re.findall(r"`(\w+)`", page))
