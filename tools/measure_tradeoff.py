@@ -31,7 +31,7 @@ from preface.model.pretrained import prior_flag
 from preface.model.training.prior_files import read_prior
 from preface.shards import Dataset
 from tradeoff import fitting, report
-from tradeoff.front import chosen
+from tradeoff.front import IMAGES, chosen
 from tradeoff.measuring import Task, measure_apart, views_of
 from tradeoff.points import fullest, render_points
 
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     render.add_argument("--people", nargs="+", help="identities (default: the first three of the model)")
     render.add_argument("--views", type=whole_number(1), default=1, help="of each, not seen by the model")
     render.add_argument(
-        "--images", type=whole_number(1), default=24, help="of a head, that share its preparation"
+        "--images", type=whole_number(1), default=IMAGES, help="of a head, that share its preparation"
     )
     render.add_argument("--small", action="store_true", help="a third of the points")
     render.add_argument("--output", type=Path, required=True)

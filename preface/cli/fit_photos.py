@@ -31,7 +31,7 @@ from preface.cli.fit import FitCommand
 from preface.cli.output import size
 from preface.cli.usage import UsageError
 from preface.model.fitting.configuration import MAX_VIEWS
-from preface.model.pretrained import PRETRAINED
+from preface.model.pretrained import PRETRAINED, flag_word
 from preface.model.training.prior_files import Prior, read_prior
 from preface.plain_words import suggestion
 from preface.shards.dataset.people import is_capture
@@ -217,7 +217,7 @@ def _photographs(count: int) -> str:
 
 
 def _align_words(command: FitCommand, files: Sequence[Path], template: Path, output: Path) -> list[str]:
-    words = ["photos", str(command.shards), "--output", str(output), "--template", str(template)]
+    words = ["photos", str(command.shards), "--output", str(output), "--template", flag_word(template)]
     words += ["--identity", command.identity] if command.identity else []
     for flag, given in (("--cameras", command.photos.cameras), ("--landmarks", command.photos.landmarks)):
         words += [flag, str(given)] if given else []

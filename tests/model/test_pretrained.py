@@ -10,7 +10,7 @@ import pytest
 from preface.artifacts import ArtifactError
 from preface.model import pretrained
 from preface.model.fitting.configuration import FitConfig
-from preface.model.pretrained import FILES, pretrained_folder, prior_flag, prior_path
+from preface.model.pretrained import FILES, flag_word, pretrained_folder, prior_flag, prior_path
 from preface.model.training.prior_files import read_prior
 
 for folder in ("training", "evaluation"):
@@ -42,6 +42,9 @@ def test_flags_keep_the_word_and_take_everything_else_as_a_path():
     assert prior_flag("pretrained") == "pretrained"
     assert prior_flag("./pretrained") == Path("pretrained")
     assert isinstance(prior_flag("./pretrained"), Path)
+    for given in ("pretrained", Path("pretrained"), Path("a/pretrained"), Path("/a/prior")):
+        read = prior_flag(flag_word(given))
+        assert (read, type(read)) == (given, type(given))
 
 
 @pytest.mark.parametrize("gone", FILES)

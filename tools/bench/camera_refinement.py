@@ -44,6 +44,7 @@ from preface.model.fitting.cameras import corrected_pose
 from preface.model.fitting.configuration import CamerasConfig, FitConfig, defaults
 from preface.model.fitting.run import fit_head
 from preface.model.matmul import denormals_flushed, keep_freed_memory
+from preface.model.pretrained import prior_flag
 from preface.model.training.prior_files import read_prior
 from preface.shards import Dataset
 from preface.shards.building import build_manifest
@@ -89,7 +90,7 @@ def _parser() -> argparse.ArgumentParser:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("shards", type=Path, help="with true cameras")
-    parser.add_argument("--prior", type=Path, required=True)
+    parser.add_argument("--prior", type=prior_flag, required=True)
     parser.add_argument("--identities", nargs="+", required=True, help="that the prior has not seen")
     parser.add_argument("--views", nargs="+", required=True, help="cameras to fit to")
     parser.add_argument("--held-out", nargs="+", help="cameras to evaluate (default: all others)")

@@ -27,6 +27,7 @@ import torch
 
 from preface.cli.output import say
 from preface.model.matmul import denormals_flushed, keep_freed_memory
+from preface.model.pretrained import prior_flag
 from preface.model.rendering.image import RenderedImage, RenderRays, Space, render_image, space_of
 from preface.model.rendering.paths import framing_camera, on_sphere
 from preface.model.rendering.shortcuts import DEFAULT_QUALITY, QUALITIES, accelerate
@@ -39,7 +40,7 @@ BYTES_PER_PIXEL = 32  # colour 12, opacity 4, depth 4, normals 12
 class Size:
     """An image to render: its side in pixels, and how."""
 
-    model: Path
+    model: str | Path
     identity: str | None
     side: int
     quality: str
@@ -112,7 +113,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("model", type=Path)
+    parser.add_argument("model", type=prior_flag)
     parser.add_argument("--identity")
     parser.add_argument("--sides", type=int, nargs="+", default=[512, 1024, 2048, 4096])
     parser.add_argument("--equal", type=int, default=512, help="largest side that is also cut otherwise")

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from preface.artifacts import ArtifactError, load_json, write_bytes
+from preface.model.training.logs import LOG_FILE, read_log
 from preface.model.training.prior_files import read_prior
 
 # A path from the root or from home: "/data/studio", but neither "1/2" nor "a / b" nor what follows "https:".
@@ -57,6 +57,7 @@ def keep(source: str, name: str, of: str, given: Path, folder: Path) -> Path:
 
     Raises:
         ArtifactError: unreadable, or the disk refuses.
+        OSError: of a prior's folder, there is no log.
     """
     measured = training_summary(given) if source == TRAINING else _read(given)
     content = {"source": source, "of": of, "measured": without_paths(measured)}
@@ -99,12 +100,14 @@ def training_summary(folder: Path) -> dict[str, Any]:
     replace earlier ones.
 
     Raises:
-        ArtifactError: no prior, or no log.
+        ArtifactError: no prior.
+        OSError: no log.
     """
     prior = read_prior(folder)
     settings = prior.configuration["training"]
     rays = settings["identities"] * settings["views"] * settings["rays"]
-    rates = {int(line["step"]): float(line["rays_per_second"]) for line in _steps(folder / "log.jsonl")}
+    lines = read_log(folder / LOG_FILE, "train")
+    rates = {int(line["step"]): float(line["rays_per_second"]) for line in lines}
     seconds, before = 0.0, 0
     for step in sorted(rates):
         seconds += (step - before) * rays / rates[step]
@@ -121,21 +124,11 @@ def training_summary(folder: Path) -> dict[str, Any]:
     }
 
 
-def _steps(path: Path) -> list[Mapping[str, Any]]:
-    lines = [json.loads(line) for line in _text(path).splitlines() if line]
-    return [line for line in lines if line["kind"] == "train"]
-
-
 def _read(path: Path) -> Any:
     """JSON that may be a list, as some benches write it."""
     try:
-        return json.loads(_text(path))
-    except ValueError as error:
-        raise ArtifactError(path, "file", f"is not JSON: {error}", "Give what a bench wrote") from error
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text()
+        return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ArtifactError.from_os(path, "reading", error) from error
+    except ValueError as error:
+        raise ArtifactError(path, "file", f"is not JSON: {error}", "Give what a bench wrote") from error

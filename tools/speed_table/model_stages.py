@@ -12,10 +12,9 @@ from preface.model.fitting.configuration import FitConfig
 from preface.model.rendering.shortcuts import DEFAULT_QUALITY, QUALITIES, Shortcuts
 from speed_table.stages import TO_SHARDS, Row, Stage, processor_time
 from tradeoff.fitting import means
-from tradeoff.front import cost
+from tradeoff.front import IMAGES, cost
 from tradeoff.points import NORMALS
 
-IMAGES = 24  # of a head, that share its preparation; as `measure_tradeoff.py` has it
 NOT_SHOWN = {"fullest", "reference", "together", "samples", "width", *NORMALS}  # of the render's groups
 FORMS = {
     "route": "float32 products",

@@ -8,6 +8,7 @@ from typing import Any
 LEAST_TO_FULL = 45.0  # dB, what `balanced` has to reach
 LARGEST_LOSS = 0.1  # dB to the photographs, that `balanced` may lose against the model as trained
 DRAFT_LOSS = 0.3  # the same of `draft`
+IMAGES = 24  # of a head, that share what is prepared for it
 Measured = Mapping[str, Any]
 
 

@@ -247,7 +247,7 @@ class _Fit:
     def _second_inversion(self) -> Phase | None:
         """Inversion's steps with corrected cameras that are left; None without, or where they are not kept."""
         correction = self._correction
-        if correction is None or self.head.step >= self._ends.second_inversion or not self._kept(correction):
+        if correction is None or not self._kept(correction) or self.head.step >= self._ends.second_inversion:
             return None
         phase = self._inverting(self._ends.cameras, self._seen_through(correction, self._as_the_prior_sees()))
         if phase.start == 0:
@@ -269,12 +269,12 @@ class _Fit:
             self.say(
                 f"cameras: views are met {found:+.2f} dB better, of the {least:g} dB that it takes: {words}"
             )
-        if (self.head.fit or {})["refinement"]["kept"]:
-            return True
-        self._correction = None
-        fit = {**(self.head.fit or {}), "cameras": {}}
-        self.head = replace(self.head, step=self._ends.second_inversion, fit=fit)
-        return False
+            if not kept:
+                self._correction = None
+                self.head = replace(self.head, step=self._ends.second_inversion, fit={**fit, "cameras": {}})
+            self.save()  # there may be no step after it that would
+        correction.cameras.requires_grad_(False)  # nothing moves them from here on
+        return self._correction is not None
 
     def _as_the_prior_sees(self) -> TrainingData:
         """The views at the prior's resolution."""

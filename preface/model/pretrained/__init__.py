@@ -49,3 +49,8 @@ def prior_path(given: str | os.PathLike[str]) -> Path:
 def prior_flag(text: str) -> str | Path:
     """The type of a flag that takes a prior; the word `pretrained` stays one until the prior is read."""
     return text if text == PRETRAINED else Path(text)
+
+
+def flag_word(given: object) -> str:
+    """What to write where a command reads it by `prior_flag`, so that a path stays one whatever its name is."""
+    return f"./{given}" if given == Path(PRETRAINED) else str(given)

@@ -84,6 +84,17 @@ def test_a_fit_without_finetuning_ends_in_order_when_corrections_are_refused(bal
     assert read_prior(tmp_path / "a").finished
 
 
+def test_corrections_are_judged_where_no_inversion_follows_them(balls, prior, tmp_path):
+    """The code stays where it starts, and nothing but the judgement comes after the cameras' steps."""
+    inversion, finetuning = {"steps": 0, "start": "mean"}, {"steps": 0}
+    cameras = {"least_gain": 99.0}
+    fit_head(config(balls, prior, tmp_path / "a", inversion, finetuning, None, cameras, **REFINED), quiet)
+    head = read_prior(tmp_path / "a")
+    assert head.finished
+    assert head.fit["refinement"]["kept"] is False
+    assert head.fit["cameras"] == {}
+
+
 def test_cameras_without_a_prior_have_nothing_to_agree_with(balls, tmp_path):
     with pytest.raises(TrainingConfigError, match=r"--refine-cameras.*fit from a prior"):
         fit_head(config(balls, "none", tmp_path / "a", **REFINED), quiet)
@@ -162,19 +173,33 @@ def test_a_fit_that_is_interrupted_in_any_phase_goes_on_bit_for_bit(
         assert ours == theirs
 
 
+@pytest.mark.parametrize(
+    ("begins_with", "phase"),
+    [
+        ("refinement_trainer", "cameras"),
+        ("gain", "inversion again"),  # not judged yet
+        ("start_code", "inversion again"),  # judged
+        ("finetuning_trainer", "finetuning"),
+    ],
+)
 def test_a_fit_that_is_killed_between_the_phases_goes_on_bit_for_bit(
-    balls, prior, straight, tmp_path, monkeypatch
+    balls, prior, straight, tmp_path, monkeypatch, begins_with, phase
 ):
     here = config(balls, prior, tmp_path / "head", **REFINED)
+    usual = getattr(run_module, begins_with)
 
     def killed(*arguments, **named):
-        raise KeyboardInterrupt
+        if (tmp_path / "head" / "model.json").exists():  # not where the code starts for the first time
+            raise KeyboardInterrupt
+        return usual(*arguments, **named)
 
     with monkeypatch.context() as patched:
-        patched.setattr(run_module, "finetuning_trainer", killed)
+        patched.setattr(run_module, begins_with, killed)
         with pytest.raises(KeyboardInterrupt):
             fit_head(here, quiet)
-    assert read_prior(tmp_path / "head").step == PHASES["finetuning"]
+    before = read_prior(tmp_path / "head")
+    assert before.step == PHASES[phase]
+    assert ("refinement" in before.fit) == (begins_with in ("start_code", "finetuning_trainer"))
     fit_head(here, quiet)
     assert_equal_bits(tensors(tmp_path / "head"), tensors(straight))
 
@@ -221,10 +246,12 @@ def test_finer_views_are_inverted_at_the_priors_resolution(balls, prior, tmp_pat
 
     monkeypatch.setattr(run_module, "inversion_trainer", noted)
     steps = {"inversion": {"steps": 2, "patch": 8}, "finetuning": {"steps": 1}}
-    fit_head(config(balls, prior, tmp_path / "a", **steps), quiet)
-    assert sizes == [(12, 16)]
+    fit_head(config(balls, prior, tmp_path / "a", **steps, **REFINED), quiet)
+    assert sizes == 2 * [(12, 16)]
     assert read_prior(tmp_path / "a").scene.resolution == (ball_heads.WIDTH, ball_heads.HEIGHT)
     assert (tmp_path / "a" / "inversion_views" / "manifest.json").exists()
+    cameras = read_prior(tmp_path / "a").fit["cameras"]
+    assert all(np.any(cameras[view]["rotation"]) for view in small_fits.VIEWS)
 
 
 # ------------------------------------------------------------------------------------------- bad input
@@ -239,7 +266,7 @@ def test_a_folder_of_another_fit_or_of_a_prior_is_refused(balls, prior, straight
     refused(
         config(balls, prior, straight, views=("camera0",), **REFINED), r"views is \['camera1', 'camera4'\]"
     )
-    refused(config(balls, "none", straight, **REFINED), r"inputs\.prior is \w+ there and None now.*inversion")
+    refused(config(balls, "none", straight), r"inputs\.prior is \w+ there and None now.*inversion")
     refused(config(balls, prior, straight, {"steps": 9}, **REFINED), r"inversion\.steps is 8 there and 9 now")
     refused(config(balls, prior, prior), "would overwrite.*another --output")
 
