@@ -1,6 +1,6 @@
 """Who may import whom, and what a command may load before it has read its arguments.
 
-The table is that of the README's layers: each part of the package with what it may know. Imports are read from the
+The table is that of CONTRIBUTING: each part of the package with what it may know. Imports are read from the
 source, those inside functions too; what an import at run time pulls in is followed through the whole package.
 """
 

@@ -59,10 +59,10 @@ TOURS = {
         f"{_spec('folder for nerfstudio', 'transforms')} per identity; `import` {_CAPTURE} with rigs",
         (
             "preface-build-shards studio/capture --rig studio --alignment alignment --output shards "
-            "--resolution 512x768 --holdout 10%",
+            "--resolution 256x384 --holdout 10%",
             "preface-build-shards pictures --rig person --alignment person --output shards --resolution 270x480 "
             "--masks matte",
-            "preface-build-shards studio/capture --rig studio --alignment alignment --resolution 512x768 --dry-run",
+            "preface-build-shards studio/capture --rig studio --alignment alignment --resolution 256x384 --dry-run",
             "preface-build-shards export shards --format rays --identities NAME --output rays",
             "preface-build-shards import DATA --layout cafca --output capture",
         ),

@@ -62,8 +62,8 @@ class RealFaces:
     counts: tuple[int, ...] = (2, 3, 5, 7)
     """Numbers of pictures to fit to, of a walk-around."""
     one_command: tuple[int, ...] = (3,)
-    """Numbers of pictures, of a walk-around and among --counts, to fit to with nothing else known, too: cameras and masks
-    are found by preface-fit."""
+    """Numbers of pictures, of a walk-around and among --counts, to fit to with nothing else known, too: cameras and
+    masks are found by preface-fit."""
     squares: str = "9x6"
     """Of the studio's chessboard, inner corners."""
     square_size: float = 0.010

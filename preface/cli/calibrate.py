@@ -206,6 +206,7 @@ def _add_board(commands: Any) -> None:
         "--jobs", type=whole_number(1), metavar="N", help="processes that find boards (default: all cores)"
     )
     _add_output(parser, "for several takes a folder, which then holds rigs/TAKE.json")
+    parser.set_defaults(output=None)  # what it is depends on the number of takes
 
 
 def _add_photos(commands: Any) -> None:

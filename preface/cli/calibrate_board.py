@@ -120,9 +120,8 @@ def _takes(config: argparse.Namespace) -> list[CalibrationTake]:
 
 def _rig_paths(config: argparse.Namespace, takes: Sequence[CalibrationTake]) -> list[Path]:
     """Where the rigs go, and that it exists."""
-    output, many = config.output, len(takes) > 1
-    if many and output == Path("rig.json"):
-        output = Path()  # nobody named a file
+    many = len(takes) > 1
+    output = config.output or Path("." if many else "rig.json")
     if many and (output.suffix == ".json" or config.report):
         flag = "--report" if config.report else "--output"
         raise UsageError(

@@ -105,12 +105,16 @@ def _artifacts(path: Path) -> list[Report]:
         problem = "holds shards and no manifest.json: building was not finished"
         raise ArtifactError(path, "folder", problem, "Run preface-build-shards again")
     if not found:
-        problem = (
-            "holds neither a capture.json nor a rig.json nor an alignment.json nor a manifest.json of shards "
-        )
-        problem += "nor a folder subjects"
-        raise ArtifactError(path, "folder", problem, "Name an artefact or the folder that holds it")
+        problem = f"holds none of {', '.join(_NAMES)}, nor a folder subjects"
+        raise ArtifactError(path, "folder", problem, _name_one(path))
     return found
+
+
+def _name_one(folder: Path) -> str:
+    """The remedy for a folder that holds nothing of its own: what is in it, such as a head's figures or rigs."""
+    deeper = sorted(file.parent for name in _NAMES for file in folder.glob(f"*/{name}"))
+    perhaps = [*deeper, *sorted(folder.glob("*.json"))]
+    return f"Name an artefact or the folder that holds it{f', such as {perhaps[0]}' if perhaps else ''}"
 
 
 def _inspect_artifact(report: Report) -> Report:

@@ -44,7 +44,7 @@ def summarise_prior(path: Path, problems: list[ArtifactError]) -> dict[str, Any]
 
 def _summarise_fit(fit: Mapping[str, Any]) -> dict[str, Any]:
     """What a head was fitted to, and how."""
-    size, loss = fit["resolution"], fit["inversion"]["loss"]
+    size, loss, refined = fit["resolution"], fit["inversion"]["loss"], fit.get("refinement")
     moved = {
         name: f"{np.degrees(np.linalg.norm(correction['rotation'])):.2f} degrees, "
         f"{1e3 * np.linalg.norm(correction['translation_m']):.1f} mm"
@@ -60,6 +60,11 @@ def _summarise_fit(fit: Mapping[str, Any]) -> dict[str, Any]:
         if fit["prior"] is None
         else f"the prior with model.json {fit['prior'][:12]}...",
         "inversion": f"{fit['inversion']['steps']} steps" + ("" if loss is None else f", loss {loss:.4g}"),
+        **({} if refined is None else {"corrections_of_cameras": _judged(refined)}),
         "finetuning": f"{fit['finetuning']['steps']} steps",
         "quality": fit["quality"],
     }
+
+
+def _judged(refined: Mapping[str, Any]) -> str:
+    return f"{'kept' if refined['kept'] else 'not kept'}, views met {refined['gain_db']:+.2f} dB better with them"

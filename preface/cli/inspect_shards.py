@@ -35,6 +35,7 @@ def summarise_dataset(path: Path, problems: list[ArtifactError]) -> dict[str, An
             "resolution": f"{manifest.width}x{manifest.height}",
             "identities": list(dataset.names),
             "splits": {name: len(names) for name, names in manifest.splits.items()},
+            "held_out": list(manifest.splits.get("holdout", ())),
             "views": int(valid.sum()),
             "views_per_identity": manifest.views,
             "missing_views": int((~valid).sum()),

@@ -11,7 +11,8 @@ from preface.cli.fit import FitCommand, PhotographsConfig, main, parse
 from preface.cli.inspect_prior import summarise_prior
 from preface.model.fitting.configuration import QUALITIES
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "model" / "training"))
+for folder in ("training", "evaluation"):
+    sys.path.insert(0, str(Path(__file__).parents[1] / "model" / folder))
 
 SMALL = ["--device", "cpu", "--quality", "draft", "--inversion.lpips", "0", "--inversion.steps", "2"]
 SMALL += ["--inversion.patches", "1", "--inversion.patch", "8", "--finetuning.steps", "2"]
@@ -94,6 +95,15 @@ def test_a_head_is_fitted_and_its_path_printed_last(balls, tmp_path, capsys):
     assert "are taken already" in capsys.readouterr().err
     assert status_of([*words, "--output", head, *SMALL, *MODEL, "--seed", "5"]) == 1
     assert "seed is 0 there and 5 now" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("kept", "words"), [(True, "kept, "), (False, "not kept, ")])
+def test_what_became_of_corrections_of_the_cameras_is_inspected(tmp_path, kept, words):
+    from untrained import fitted_to, write_model
+
+    fit = fitted_to(["camera1"]) | {"refinement": {"gain_db": -0.123, "kept": kept}}
+    said = summarise_prior(write_model(tmp_path, ["id0000"], fit=fit), [])
+    assert said["corrections_of_cameras"] == f"{words}views met -0.12 dB better with them"
 
 
 def test_a_command_fits_what_it_was_told():

@@ -90,6 +90,22 @@ def test_a_folder_with_a_rig_and_a_capture_shows_both(capture):
     assert "focal length px 13512.2" in result.stdout
 
 
+def test_a_folder_without_artefacts_says_what_may_be_meant(tmp_path):
+    empty, rigs, evaluation = (tmp_path / name for name in ("empty", "rigs", "evaluation"))
+    for file in (rigs / "monday.json", evaluation / "report.json", evaluation / "head" / "metrics.json"):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    empty.mkdir()
+    told = run(empty, rigs, evaluation)
+    assert told.returncode == 1
+    first, second, third = told.stderr.splitlines()
+    assert first.endswith(
+        "metrics.json, nor a folder subjects. Name an artefact or the folder that holds it."
+    )
+    assert second.endswith(f", such as {rigs / 'monday.json'}.")
+    assert third.endswith(f", such as {evaluation / 'head'}.")
+
+
 def test_every_problem_is_told_not_only_the_first(capture):
     write_png(capture / "subjects/a/front.png", np.zeros((6, 6, 3), np.uint8))
     (capture / "subjects/a/left.png").write_bytes(b"not an image")

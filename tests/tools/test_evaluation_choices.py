@@ -30,7 +30,6 @@ def test_normals_change_no_figure_and_every_choice_is_measured(tmp_path, capsys)
     output, before = tmp_path / "evaluation.json", torch.get_num_threads()
     shards, model = str(tmp_path / "balls"), str(tmp_path / "prior")
     assert main([shards, model, "--people", *names, "--output", str(output)]) == 0
-    torch.set_num_threads(before)
     assert capsys.readouterr().out.splitlines()[-1] == str(output)
     rows = {(row["quality"], row["normals"]): row for row in json.loads(output.read_text())["rows"]}
     assert set(rows) == {(q, n) for q in ("draft", "balanced", "reference") for n in (True, False)}
@@ -39,3 +38,4 @@ def test_normals_change_no_figure_and_every_choice_is_measured(tmp_path, capsys)
         assert rows[quality, True]["psnr"] == pytest.approx(rows[quality, False]["psnr"], abs=1e-6)
     assert rows["reference", False]["psnr_off"] == 0
     assert main([shards, str(tmp_path / "nothing"), "--output", str(output)]) == 1
+    torch.set_num_threads(before)

@@ -75,7 +75,7 @@ def cost(config: Any, pixels: int, held_out: int) -> float:
     """What a fit and its evaluation are worth in rays of training without regularisers, roughly.
 
     A step with predicted normals takes gradients of gradients; LPIPS costs more than the rays that it looks at; an
-    evaluation renders normals and measures. Factors are those of the `tiny` model on one core.
+    evaluation renders and measures. Factors are those of the `tiny` model on one core.
 
     Args:
         config: a `FitConfig` with its steps as numbers.

@@ -12,7 +12,7 @@ from preface.model.fitting.configuration import FitConfig
 from preface.model.rendering.shortcuts import DEFAULT_QUALITY, QUALITIES, Shortcuts
 from speed_table.stages import TO_SHARDS, Row, Stage, processor_time
 from tradeoff.fitting import means
-from tradeoff.front import IMAGES, cost
+from tradeoff.front import IMAGES, LARGEST_LOSS, LEAST_TO_FULL, cost
 from tradeoff.points import NORMALS
 
 NOT_SHOWN = {"fullest", "reference", "together", "samples", "width", *NORMALS}  # of the render's groups
@@ -134,7 +134,8 @@ STAGES = (
         "Render, shortcuts",
         "render",
         f"`--quality {DEFAULT_QUALITY}`",
-        "It is the cheapest that stays within 45 dB of the fullest render and 0.1 dB of the model as trained.",
+        f"It is the cheapest on the front that has at least {LEAST_TO_FULL:g} dB to the fullest render and loses at "
+        f"most {LARGEST_LOSS:g} dB to the photographs against the model as trained.",
         render,
     ),
     Stage(

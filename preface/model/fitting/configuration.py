@@ -141,7 +141,7 @@ class FitConfig:
     """Which defaults all flags below have: for a minute and a half or for six on two processor cores with a small
     prior, or the paper's."""
     refine_cameras: bool = False
-    """Find small corrections of the cameras, too, and keep them if the views agree much better with them. Takes a
+    """Find small corrections of the cameras, too, and keep them if the views agree much better with them. Needs a
     prior."""
     seed: int = 0
     """Everything random follows from this number."""

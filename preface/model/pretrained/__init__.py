@@ -30,7 +30,8 @@ def pretrained_folder() -> Path:
     missing = [name for name in FILES if not (FOLDER / name).is_file()]
     if missing:
         problem = f"this preface was installed without it ({', '.join(missing)} missing)"
-        remedy = "Install preface with its package data, or give the folder of a prior, or --prior none to preface-fit"
+        remedy = "Install one that has them, or give the folder of a prior that preface-train wrote"
+        remedy += ", or --prior none to preface-fit"
         raise ArtifactError(FOLDER, PRETRAINED, problem, remedy)
     return FOLDER
 

@@ -54,11 +54,10 @@ def test_the_layer_for_normals_is_added_without_changing_what_is_seen(prior, hea
     assert with_predicted_normals(head, 5) is head
 
 
-def values_of(terms, model, data, correction=None):
+def values_of(terms, model, data):
     """The terms of a grid of rays, with their graphs."""
     batch = grids(data, 8)[0]
-    rays = Rays.from_batch(batch)
-    seen = model(rays if correction is None else correction.apply(rays, batch.view), code_of(model))
+    seen = model(Rays.from_batch(batch), code_of(model))
     return {term.name: (term.weight, term.value(seen, Part(0, batch, 0, 1))) for term in terms}
 
 

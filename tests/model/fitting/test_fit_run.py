@@ -189,6 +189,8 @@ def test_a_fit_that_is_killed_between_the_phases_goes_on_bit_for_bit(
     usual = getattr(run_module, begins_with)
 
     def killed(*arguments, **named):
+        if begins_with == "finetuning_trainer":
+            assert not any(one.requires_grad for one in named["correction"].cameras.parameters())
         if (tmp_path / "head" / "model.json").exists():  # not where the code starts for the first time
             raise KeyboardInterrupt
         return usual(*arguments, **named)

@@ -1,0 +1,54 @@
+"""``tools/real_faces.py``: which pictures are fitted to, how cameras are brought onto others, and what is refused."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+
+import real_faces
+from preface.geometry import Rigid, Similarity
+
+
+def cameras(count: int) -> dict[str, np.ndarray]:
+    """Poses of cameras around a head, each turned its own way."""
+    rng = np.random.default_rng(count)
+    turns = Rotation.random(count, random_state=count).as_matrix()
+    places = rng.normal([0.0, 0.0, 2.0], size=(count, 3))
+    return {f"cam{n}": np.hstack([turns[n], places[n][:, None]]) for n in range(count)}
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_cameras_of_another_frame_and_scale_are_brought_onto_the_shipped_ones(count):
+    shipped = cameras(count)
+    motion = Similarity(0.03, Rotation.from_rotvec([0.2, -1.0, 0.5]).as_matrix(), [1.0, -2.0, 3.0])
+    found = {
+        name: motion.apply_to_pose(Rigid(pose[:, :3], pose[:, 3])).matrix[:3]
+        for name, pose in shipped.items()
+    }
+    known_to_one_alone = {"another": shipped["cam0"]}
+    between = real_faces._between(shipped | known_to_one_alone, found)
+    assert float(between.scale) == pytest.approx(0.03, rel=1e-9)
+    np.testing.assert_allclose(between.rotation, motion.rotation, atol=1e-9)
+    np.testing.assert_allclose(between.translation, motion.translation, atol=1e-9)
+
+
+def test_pictures_are_spread_from_one_side_to_the_other():
+    names = list("abcdefghi")
+    assert real_faces._spread(names, 3) == ["a", "e", "i"]
+    most = real_faces._spread(names, 7)
+    assert all(set(real_faces._spread(most, count)) <= set(most) for count in (2, 3, 5, 7))
+
+
+def test_what_is_not_there_is_named_and_ends_with_one(tmp_path, capsys):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "rig.json").write_text("{}")
+    words = [str(tmp_path / "nobody"), "--output", str(tmp_path / "out")]
+    assert real_faces.main(["walk-around", *words]) == 1
+    assert str(tmp_path / "nobody" / "images") in capsys.readouterr().err
+    (tmp_path / "file").write_text("mine")
+    assert real_faces.main(["walk-around", *words[:2], str(tmp_path / "file" / "out")]) == 1
+    assert "real_faces: " in capsys.readouterr().err
