@@ -49,6 +49,7 @@ _OS_REMEDIES = {
     errno.EROFS: "That file system is read-only; choose another place",
     errno.ENOENT: "Correct the path, or create what is missing",
     errno.ENOTDIR: "Correct the path: one of its folders is a file",
+    errno.EEXIST: "A file stands where a folder is to be; remove it, or choose another place",
     errno.EISDIR: "Correct the path: it names a folder, and a file is expected",
     errno.ENAMETOOLONG: "Choose a shorter name",
     errno.ELOOP: "Remove the symbolic links that lead in a circle",

@@ -16,6 +16,7 @@ from preface.capture.manifest import DICTIONARY_SIZES, Board
 from preface.plain_words import suggestion
 
 BOARD_TYPES = ("charuco", "chessboard", "aprilgrid")
+_LARGEST_SQUARE = 1.0  # metres; who says 10 means millimetres
 
 
 class BoardError(ValueError):
@@ -70,8 +71,9 @@ def _check(board: Board) -> None:
         raise BoardError(
             f"squares: {_counted(board)} cannot be a {board.type}; give COLUMNSxROWS of the print"
         )
-    if not 0 < board.square_size <= 10:
-        raise BoardError(f"square_size: {board.square_size} is not a length in metres; measure it again")
+    if not 0 < board.square_size <= _LARGEST_SQUARE:
+        problem = f"square_size: {board.square_size} is not a length in metres from 0 to {_LARGEST_SQUARE:g}"
+        raise BoardError(f"{problem}; 25 mm are 0.025")
     if board.type == "chessboard":
         for name in ("marker_size", "dictionary", "legacy", "inverted"):
             if getattr(board, name) is not None:

@@ -56,6 +56,7 @@ def test_squares_are_columns_by_rows():
         (("charuco", (5, 4), 0.05, 0.04), "dictionary: is missing"),
         (("charuco", (5, 4), 0.05, 0.06, "DICT_4X4_50"), "marker_size: 0.06 m is not between"),
         (("charuco", (5, 4), 54.0, 40.0, "DICT_4X4_50"), "square_size: 54.0 is not a length in metres"),
+        (("chessboard", (9, 6), 10.0), "25 mm are 0.025"),
         (("charuco", (5, 4), 0.05, 0.04, "DICT_4X4_55"), "Perhaps 'DICT_4X4_50' was meant"),
         (("charuco", (15, 14), 0.05, 0.04, "DICT_4X4_50"), "holds 50 markers, but the board shows 105"),
         (("charuco", (1, 4), 0.05, 0.04, "DICT_4X4_50"), "squares: 1x4 cannot be"),
