@@ -160,11 +160,12 @@ def _dataset(facts: Facts) -> str:
 
 
 def _training(facts: Facts) -> str:
-    prior = facts.prior
+    prior, trained = facts.prior, facts.prior.configuration["model"]["matmul"]
     where = f", on {facts.machine}" if facts.machine else ""
     lines = [
         f"Preset `{prior.configuration.get('preset')}`, seed {prior.provenance['seed']}, {prior.steps:,} steps{where}. "
-        "`model.json` has every setting and the versions of all packages. From nothing:",
+        f"`model.json` has every setting and the versions of all packages. Its products were {trained}; released, it "
+        f"multiplies in {prior.model.matmul}. From nothing:",
         "| stage | time | command |\n|---|---|---|\n"
         + "\n".join(f"| {s.name} | {_time(s.seconds)} | `{shlex.join(_words(s))}` |" for s in facts.stages),
     ]
@@ -202,12 +203,17 @@ def _figures(facts: Facts) -> str:
     for result in facts.results:
         groups.setdefault((len(result.views), result.quality, not result.from_prior), []).append(result)
     for (views, quality, alone), group in sorted(groups.items()):
-        means = [f"{fmean(result.mean[name] for result in group):.4g}" for name in shown]
+        means = [_number(fmean(result.mean[name] for result in group)) for name in shown]
         count = f"{views} view{'s' if views > 1 else ''}"
         start = "nothing" if alone else "this prior"
         rows.append([count, quality, start, str(len(group)), str(sum(r.measured for r in group)), *means])
     parts.append("\n".join(f"| {' | '.join(row)} |" for row in rows))
     return "\n\n".join(parts)
+
+
+def _number(value: float) -> str:
+    """Decibels to two decimals, what lies between 0 and 1 to four."""
+    return f"{value:.2f}" if value >= 1 else f"{value:.4f}"
 
 
 def _files(facts: Facts) -> str:

@@ -58,7 +58,11 @@ def describe(prior, shards, **changes):
     known = read_prior(prior)
     tensors = {WEIGHTS: known.load_model().state_dict(), STATE: {"step/x": torch.zeros(3)}}
     made = provenance({"shards": "/data/of/somebody/shards"}, {"manifest.json": shards / "manifest.json"}, 7)
-    payload = prior_payload(known) | {"provenance": made, "configuration": {"preset": "tiny"}, **changes}
+    payload = prior_payload(known) | {
+        "provenance": made,
+        "configuration": {"preset": "tiny", "model": known.model.to_dict()},
+        **changes,
+    }
     write_checkpoint(prior, payload, tensors)
 
 
@@ -124,8 +128,8 @@ def test_the_card_tells_data_commands_figures_limits_and_digests(made, tmp_path,
         assert part in card
     assert "on an abacus" in card
     assert "| studio | 10 min | `python tools/synthetic_studio --output studio` |" in card
-    assert "| 2 views | draft | this prior | 2 | 2 | 22 | 0.5 |" in card
-    assert "| 2 views | draft | nothing | 2 | 2 | 17 | 0.5 |" in card
+    assert "| 2 views | draft | this prior | 2 | 2 | 22.00 | 0.5000 |" in card
+    assert "| 2 views | draft | nothing | 2 | 2 | 17.00 | 0.5000 |" in card
     assert "seed 7" in card
     for name in ("model.json", "model.safetensors", "template.json"):
         assert sha256(tmp_path / "box" / name) in card
@@ -137,7 +141,7 @@ def test_a_prior_may_be_released_again_with_figures_of_heads_fitted_from_the_rel
     before = (tmp_path / "box" / "model.json").read_bytes()
     assert run(made, tmp_path / "box", "--metrics", str(tmp_path / "new")) == 0
     assert (tmp_path / "box" / "model.json").read_bytes() == before
-    assert "| 1 | 1 | 30 |" in (tmp_path / "box" / "MODEL_CARD.md").read_text()
+    assert "| 1 | 1 | 30.00 |" in (tmp_path / "box" / "MODEL_CARD.md").read_text()
     capsys.readouterr()
 
 
