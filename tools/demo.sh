@@ -7,7 +7,7 @@
 # Prints the path of the page last.
 #   --pretrained  start from the prior that comes with preface and train none: one new person is photographed, aligned
 #                 on the prior's template and fitted
-#   OUTPUT=DIR    where to put everything (default: demo_output, or demo_output/pretrained)
+#   OUTPUT=DIR    where to put everything (default: demo_output, or demo_output_pretrained)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -26,12 +26,12 @@ bash tools/setup.sh
 bin=.venv/bin
 # Minutes that each stage takes on two cores, for the estimate of what is left.
 if $pretrained; then
-    out=${OUTPUT:-demo_output/pretrained}
+    out=${OUTPUT:-demo_output_pretrained}
     prior=pretrained
     # Another seed than that of the studio which the prior was trained in: somebody new.
     studio=(--identities 1 --takes 1 --seed 2024)
     fitted=id0000
-    minutes=(0.1 0.5 0.1 0.3 0.2 0.1 1.5 1.2 0.5 1.0 0.1)
+    minutes=(0.5 0.1 0.1 0.3 0.2 0.1 1.5 1.2 0.5 1.0 0.1)
 else
     out=${OUTPUT:-demo_output}
     prior=$out/prior
@@ -57,7 +57,6 @@ stage() { # stage NAME command...: says what is left, prints, times and notes do
 }
 
 if $pretrained; then
-    stage "prior" $bin/preface-inspect "$prior"
     size=$($bin/python -c 'import sys; from preface.model.training.prior_files import read_prior
 print("{}x{}".format(*read_prior(sys.argv[1]).scene.resolution))' "$prior")
     onto=(--template "$prior")
@@ -69,6 +68,9 @@ else
 fi
 stage "synthetic studio" $bin/python tools/synthetic_studio --output "$out" \
     "${studio[@]}" --views 13 --resolution 256x384 --board.frames 14
+if $pretrained; then
+    stage "prior" $bin/preface-inspect "$prior"
+fi
 stage "inspection" $bin/preface-inspect "$out/capture"
 stage "calibration" $bin/preface-calibrate board "$out/capture" --output "$out"
 stage "alignment" $bin/preface-align studio "$out/capture" --rig "$out" "${onto[@]}" --output "$out/alignment"
