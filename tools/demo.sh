@@ -3,7 +3,8 @@
 # pictures of a board, aligns its people, builds shards of them, trains a tiny prior on all but one of them, fits the
 # one that it has not seen from two photographs, with the prior and without, renders the head all around, measures it
 # on the photographs that were kept away, and shows it all on one page. About ten minutes on two cores, and five for
-# the set-up the first time. Every stage prints the command that it runs. Run again, it resumes where it stopped.
+# the set-up the first time. Every stage prints the command that it runs. Run again, it resumes where it stopped; delete
+# OUTPUT to begin anew.
 # Prints the path of the page last.
 #   --pretrained  start from the prior that comes with preface and train none: one new person is photographed, aligned
 #                 on the prior's template and fitted
@@ -44,15 +45,23 @@ mkdir -p "$out"
 number=0
 
 stage() { # stage NAME command...: says what is left, prints, times and notes down the command
-    local name=$1 start=$EPOCHREALTIME took left
+    local name=$1 start=$EPOCHREALTIME took left words
     shift
+    words=$(printf '%q ' "${@#$bin/}")
     left=$(printf '%s\n' "${minutes[@]:number}" | awk '{ s += $1 } END { printf "%.0f", s }')
     number=$((number + 1))
     printf '\n== %d of %d: %s, about %s minutes to the end\n$%s\n' \
         "$number" "${#minutes[@]}" "$name" "$left" "$(printf ' %q' "$@")"
+    # Not again what is done: a new calibration differs in its last bits, and all that follows would be of another rig.
+    if [[ -f $out/stages.tsv ]] &&
+        STAGE=$name WORDS=$words awk -F'\t' '$1 == ENVIRON["STAGE"] && $3 == ENVIRON["WORDS"] { done = 1 }
+            END { exit !done }' "$out/stages.tsv"; then
+        echo "== $name was done before"
+        return
+    fi
     "$@"
     took=$(awk "BEGIN { printf \"%.1f\", $EPOCHREALTIME - $start }")
-    printf '%s\t%s\t%s\n' "$name" "$took" "$(printf '%q ' "${@#$bin/}")" >> "$out/stages.tsv"
+    printf '%s\t%s\t%s\n' "$name" "$took" "$words" >> "$out/stages.tsv"
     printf '== %s took %s s\n' "$name" "$took"
 }
 
