@@ -32,6 +32,30 @@ def prior(balls, tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def data(balls):
+    """The views of the unseen head that are fitted to."""
+    import small_fits
+
+    from preface.model.fitting.observations import observe
+    from preface.shards import Dataset
+
+    with Dataset(balls) as dataset:
+        yield observe(dataset, small_fits.UNSEEN, small_fits.VIEWS, None)
+
+
+@pytest.fixture
+def correction(data):
+    """None yet, of the second and the fifth camera."""
+    from preface.geometry import Box
+    from preface.model.fitting.cameras import CameraCorrections
+    from preface.model.fitting.heads import Correction
+
+    rows = torch.tensor([-1, 0, -1, -1, 1, -1])
+    box = Box(data.scene.box[0], data.scene.box[1])
+    return Correction(CameraCorrections(2), rows, box, data.scene.scene_scale)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _one_thread():
     """Sums do not depend on how work is shared out, and the tests' workers use every core already."""

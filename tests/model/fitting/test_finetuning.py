@@ -8,29 +8,19 @@ import small_fits
 import small_runs
 import torch
 
-from preface.geometry import Box
-from preface.model.fitting.cameras import CameraCorrections
 from preface.model.fitting.finetuning import finetuning_terms, finetuning_trainer, parameter_sets
 from preface.model.fitting.heads import (
-    Correction,
     code_of,
     head_from_scratch,
     head_of_prior,
     with_predicted_normals,
 )
-from preface.model.fitting.observations import grids, observe
+from preface.model.fitting.observations import grids
 from preface.model.rays import Rays
 from preface.model.training.prior_files import read_prior
 from preface.model.training.trainer import Part
-from preface.shards import Dataset
 
 CPU = torch.device("cpu")
-
-
-@pytest.fixture
-def data(balls):
-    with Dataset(balls) as dataset:
-        yield observe(dataset, small_fits.UNSEEN, small_fits.VIEWS, None)
 
 
 @pytest.fixture
@@ -146,13 +136,6 @@ def test_a_model_from_random_weights_has_no_code_and_is_the_seeds():
 
 
 # ----------------------------------------------------------------------------------------- cameras
-
-
-@pytest.fixture
-def correction(data):
-    rows = torch.tensor([-1, 0, -1, -1, 1, -1])
-    box = Box(data.scene.box[0], data.scene.box[1])
-    return Correction(CameraCorrections(2), rows, box, data.scene.scene_scale)
 
 
 @pytest.mark.parametrize("normals", [False, True])

@@ -6,35 +6,18 @@ import pytest
 import small_fits
 import torch
 
-from preface.geometry import Box
 from preface.model.fitting.cameras import CameraCorrections
 from preface.model.fitting.heads import Correction, head_of_prior
-from preface.model.fitting.observations import observe
 from preface.model.fitting.refinement import gain, refinement_trainer
 from preface.model.training.prior_files import read_prior
-from preface.shards import Dataset
 
 CPU = torch.device("cpu")
-
-
-@pytest.fixture
-def data(balls):
-    with Dataset(balls) as dataset:
-        yield observe(dataset, small_fits.UNSEEN, small_fits.VIEWS, None)
 
 
 @pytest.fixture
 def head(prior):
     networks = read_prior(prior).load_model()
     return head_of_prior(networks, networks.codes.detach().mean(dim=0))
-
-
-@pytest.fixture
-def correction(data):
-    """None yet, of the second and the fifth camera."""
-    rows = torch.tensor([-1, 0, -1, -1, 1, -1])
-    box = Box(data.scene.box[0], data.scene.box[1])
-    return Correction(CameraCorrections(2), rows, box, data.scene.scene_scale)
 
 
 def test_views_are_met_better_and_nothing_moves_but_the_cameras(head, data, correction):
