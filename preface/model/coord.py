@@ -195,7 +195,7 @@ def integrated_pos_enc(mean: Tensor, var: Tensor, min_deg: int, max_deg: int) ->
     Returns:
         [..., 2 L b] for L levels: all sines, level by level, then all cosines.
     """
-    scales = _powers_of_two(min_deg, max_deg, mean)
+    scales = powers_of_two(min_deg, max_deg, mean)
     angles = mean[..., None, :] * scales
     attenuation = torch.exp(-0.5 * (var[..., None, :] * (scales * scales)))
     return torch.cat([(attenuation * wave).flatten(-2) for wave in (angles.sin(), angles.cos())], dim=-1)
@@ -213,13 +213,13 @@ def pos_enc(x: Tensor, min_deg: int, max_deg: int, append_identity: bool = True)
     Returns:
         [..., b + 2 L b], or [..., 2 L b] without the identity.
     """
-    angles = (x[..., None, :] * _powers_of_two(min_deg, max_deg, x)).flatten(-2)
+    angles = (x[..., None, :] * powers_of_two(min_deg, max_deg, x)).flatten(-2)
     return torch.cat(
         [x, angles.sin(), angles.cos()] if append_identity else [angles.sin(), angles.cos()], dim=-1
     )
 
 
-def _powers_of_two(min_deg: int, max_deg: int, like: Tensor) -> Tensor:
+def powers_of_two(min_deg: int, max_deg: int, like: Tensor) -> Tensor:
     """2^l for l in [min_deg, max_deg), as a column [L, 1] to scale rows by."""
     if not 0 <= min_deg <= max_deg:
         raise ValueError(f"min_deg: levels from {min_deg} to {max_deg}; they must ascend from 0 or more")

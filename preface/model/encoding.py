@@ -1,8 +1,9 @@
 """The position's encoding as the networks take it: the values of `coord`, written feature by feature.
 
-`coord.project_frustums` and `coord.integrated_pos_enc` have derivatives and define the encoding. Where no
-derivative by position is asked for, which is everywhere but in normals, this is the same in fewer passes over
-memory: one row per feature, so that every operation runs along samples, and nothing is copied into place.
+`coord.project_frustums` and `coord.integrated_pos_enc` have derivatives and define the encoding. Where none by the
+rays is asked for, which is everywhere but in cameras that are refined, this is the same in fewer passes over memory:
+one row per feature, so that every operation runs along samples, and nothing is copied into place. Normals need
+derivatives by position, but not through the waves: a sine's is a cosine, which the encoding holds already.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from preface.model import coord
+from preface.model.safe_math import full_precision
 
 
 @torch.no_grad()
@@ -50,3 +52,27 @@ def waves(angles: Tensor, decay: Tensor, levels: int) -> Tensor:
         angles.mul_(2)  # exact, as by four
         decay.mul_(4)
     return rows.flatten(0, 2)
+
+
+@full_precision
+def slope_in_space(encoded: Tensor, slope: Tensor, basis: Tensor, levels: int) -> Tensor:
+    """The gradient by position of a function of encodings, from its gradient by the encodings.
+
+    With S = a sin(2^l x) and C = a cos(2^l x), whose attenuation a does not depend on the position x along a direction
+    b of the basis, dS/dx = 2^l C and dC/dx = -2^l S. So derivatives of the result, by weights of a network behind
+    `slope`, bypass sines and exponentials: second-order gradients cost little more than the products they consist of.
+
+    Args:
+        encoded: [p, 2 levels b].
+        slope: [p, 2 levels b], what the function's value changes by with each feature.
+        basis: [3, b].
+        levels: of the encoding.
+
+    Returns:
+        [p, 3], per scene unit.
+    """
+    rows = (2, levels, basis.shape[1], len(encoded))
+    sine, cosine = encoded.T.view(rows)
+    turned = torch.stack((cosine, -sine)) * coord.powers_of_two(0, levels, encoded)[..., None]
+    along = (turned * slope.T.view(rows)).sum(dim=(0, 1))
+    return (basis[..., None] * along).sum(dim=1).T  # no product of matrices, whose precision may be reduced

@@ -7,6 +7,7 @@ batches into chunks and add gradients up (`preface.model.training.trainer.Option
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -205,6 +206,11 @@ class PriorModel(nn.Module):
             rays.origins, rays.directions, tdist, rays.radii, self.basis, self.levels
         )
 
+    def _moving_encoding(self, rays: Rays, tdist: Tensor) -> Tensor:
+        """As `_encode`, with derivatives by the rays."""
+        mean, var = coord.project_frustums(rays.origins, rays.directions, tdist, rays.radii, self.basis)
+        return coord.integrated_pos_enc(mean, var, 0, self.levels).flatten(0, 1)
+
     def _level(self, rays: Rays, sdist: Tensor, tdist: Tensor, raw: Tensor) -> Level:
         density = volume.density_from_raw(raw.view(tdist[:, 1:].shape))
         weights = volume.compute_alpha_weights(density, tdist, rays.directions)[0]
@@ -219,21 +225,19 @@ class PriorModel(nn.Module):
         """
         head = biases[len(self.nerf.layers)]
         moving = torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad)
-        if not normals and not moving:
-            features = self.nerf.trunk(self._encode(rays, tdist), biases, self.products)
-            return features, self.nerf.raw_density(features, head), None
-        mean, var = coord.project_frustums(rays.origins, rays.directions, tdist, rays.radii, self.basis)
+        encoded = self._moving_encoding(rays, tdist) if moving else self._encode(rays, tdist)
         keep = torch.is_grad_enabled()
-        with torch.enable_grad():
-            mean = mean if moving else mean.detach().requires_grad_()
-            encoded = coord.integrated_pos_enc(mean, var, 0, self.levels).flatten(0, 1)
+        with torch.enable_grad() if normals else contextlib.nullcontext():
+            if normals and not moving:
+                encoded.requires_grad_()
             features = self.nerf.trunk(encoded, biases, self.products)
             raw = self.nerf.raw_density(features, head)
             if not normals:
                 return features, raw, None
-            (gradient,) = torch.autograd.grad(raw.sum(), mean, create_graph=keep)
-        in_space = (gradient[..., None, :] * self.basis).sum(dim=-1)
-        found = losses.normals_from_density_gradient(in_space)
+            (slope,) = torch.autograd.grad(raw.sum(), encoded, create_graph=keep)
+        given = encoded if moving else encoded.detach()
+        in_space = encoding.slope_in_space(given, slope, self.basis, self.levels)
+        found = losses.normals_from_density_gradient(in_space).view(*tdist[:, 1:].shape, 3)
         return (features, raw, found) if keep else (features.detach(), raw.detach(), found)
 
 

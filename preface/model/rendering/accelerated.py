@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from preface.model import coord, losses, sampling, stepfun, volume
+from preface.model import coord, encoding, losses, sampling, stepfun, volume
 from preface.model.configuration import ModelConfig
 from preface.model.folded import fold
 from preface.model.model import Level, PriorModel, Render
@@ -24,7 +24,7 @@ from preface.model.networks import Products, Trunk
 from preface.model.rays import Rays
 from preface.model.rendering.image import SEEN, RenderRays, Space
 from preface.model.rendering.occupancy import Occupancy, learn_occupancy, model_density
-from preface.model.rendering.samples import encode_samples, sample_gaussians
+from preface.model.rendering.samples import encode_samples
 from preface.model.rendering.shortcuts import Shortcuts
 from preface.model.safe_math import interpolate_sorted
 
@@ -254,14 +254,12 @@ class ShortRenderer:
         if self.shortcuts.predicted_normals and nerf.normals is not None:
             raw = nerf.raw_normals(features, biases[len(nerf.layers) + 2])
             return None, _spread(losses.normals_from_density_gradient(raw), chosen, weights.shape)
-        mean, variance = (x.T.contiguous() for x in sample_gaussians(rays, tdist, chosen, model.basis))
+        encoded = encode_samples(rays, tdist, chosen, model.basis, model.levels)
         with torch.enable_grad():
-            mean.requires_grad_()
-            encoded = coord.integrated_pos_enc(mean, variance, 0, model.levels)
-            again = nerf.trunk(encoded, biases, model.products)
+            again = nerf.trunk(encoded.requires_grad_(), biases, model.products)
             total = nerf.raw_density(again, biases[len(nerf.layers)]).sum()
-            (gradient,) = torch.autograd.grad(total, mean)
-        in_space = (gradient[:, None, :] * model.basis).sum(dim=-1)
+            (slope,) = torch.autograd.grad(total, encoded)
+        in_space = encoding.slope_in_space(encoded.detach(), slope, model.basis, model.levels)
         return _spread(losses.normals_from_density_gradient(in_space), chosen, weights.shape), None
 
 

@@ -13,17 +13,18 @@ from preface.model.rays import Rays
 
 
 @torch.no_grad()
-def sample_gaussians(rays: Rays, tdist: Tensor, chosen: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
-    """Some intervals of rays as Gaussians along the directions of a basis, as `coord.project_frustums`.
+def encode_samples(rays: Rays, tdist: Tensor, chosen: Tensor, basis: Tensor, levels: int) -> Tensor:
+    """Encode some intervals of rays, without derivatives.
 
     Args:
         rays: m of them.
         tdist: [m, k + 1], ascending ray parameters.
         chosen: int64 [p], numbers ray * k + place of the intervals.
         basis: [3, b].
+        levels: of the encoding.
 
     Returns:
-        mean and variance, [b, p].
+        [p, 2 levels b], the chosen rows of `preface.model.encoding.encode_intervals`.
     """
     anchor, offset, t_var, r_var = coord.frustums_about_anchor(tdist, rays.radii)
     axes = coord.project_axes(rays.origins, rays.directions, anchor, basis)
@@ -31,18 +32,8 @@ def sample_gaussians(rays: Rays, tdist: Tensor, chosen: Tensor, basis: Tensor) -
     middle, along, across = (part.T.contiguous().index_select(1, ray) for part in axes)
     shift, t_var, r_var = (x.reshape(-1).index_select(0, chosen) for x in (offset, t_var, r_var))
     mean = middle.addcmul_(along, shift)
-    return mean, along.square_().mul_(t_var).addcmul_(across, r_var)
-
-
-def encode_samples(rays: Rays, tdist: Tensor, chosen: Tensor, basis: Tensor, levels: int) -> Tensor:
-    """Encode some intervals of rays, without derivatives; arguments as `sample_gaussians`.
-
-    Returns:
-        [p, 2 levels b], the chosen rows of `preface.model.encoding.encode_intervals`.
-    """
-    mean, variance = sample_gaussians(rays, tdist, chosen, basis)
-    with torch.no_grad():
-        return encoding.waves(mean, variance.mul_(-0.5), levels).T
+    decay = along.square_().mul_(t_var).addcmul_(across, r_var).mul_(-0.5)
+    return encoding.waves(mean, decay, levels).T
 
 
 @torch.no_grad()

@@ -210,8 +210,8 @@ class Trainer:
             values[index] += value.detach() * share
             if value.requires_grad:  # nothing does where no ray meets the box
                 total = value * term.weight if total is None else total + value * term.weight
-        if total is not None:
-            (total * share).backward()
+        if total is not None:  # positions, by which normals differentiated, need no gradient any more
+            (total * share).backward(inputs=list(self.parameters.values()))
 
     def _measured(self, step: int, rays: int) -> Outcome:
         """Read the terms and norms, in one transfer, and refuse what is not finite."""
