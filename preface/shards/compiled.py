@@ -1,12 +1,9 @@
-"""The compiled twins of the two loops that a batch spends its time in: rays formed, and random numbers drawn.
+"""The compiled twin of the loop that a batch spends its time in: rays formed.
 
-They do what `preface.shards.rays` and `preface.shards.streams` do, operation by operation in the same precision,
-so that their results are the same bits (but for the radii, where torch's square root may be a rounding off); the
-formulas and their sources stand there. What is different is that all of a ray is done while it is in the cache,
-and that its fields are written once. The tests hold one against the other.
-
-Importing this needs numba, which is optional: `preface.shards.routes` says whether it is there. Compiling takes
-seconds, once per machine: the result is kept where numba keeps such things.
+It does what `preface.shards.rays` does, operation by operation in the same precision, so that its results are the
+same bits (but for the radii, where torch's square root may be a rounding off); the formulas and their sources
+stand there. What is different is that all of a ray is done while it is in the cache, and that its fields are
+written once. The tests hold one against the other.
 
 A block of rays goes through in stages, each a loop without branches over rows of `LANES` numbers in two scratch
 arrays, which is what a compiler turns into vector instructions. No fast-math: nothing is reordered or fused.
@@ -15,17 +12,14 @@ arrays, which is what a compiler turns into vector instructions. No fast-math: n
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
-from typing import Any
 
-import numba
 import numpy as np
 import torch
 from numba import types
 from torch import Tensor
 
 from preface.shards.batches import Batch
+from preface.shards.compiling import compiled_for, input_of, output_of, stage
 from preface.shards.rays import COEFFICIENTS, DERIVED, FAR, FINITE, ORIGIN, RADIUS, SERIES, RayTable
 
 # Rays per block: both scratch arrays stay in a core's first-level cache. The paper's 128 of a view are one block.
@@ -50,12 +44,8 @@ _ZERO, _ONE, _TWO, _THREE, _FOUR = (np.float32(number) for number in range(5))
 _RADIUS, _LARGEST, _SMALLEST = np.float32(RADIUS), np.float32(FINITE), np.float32(-FINITE)
 _BYTE = np.float32(255)
 
-# Division by zero is infinite, and not an exception.
-_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-_stage = numba.njit(**_OPTIONS)
 
-
-@_stage
+@stage
 def _fill_from_one(
     single: np.ndarray,
     double: np.ndarray,
@@ -78,7 +68,7 @@ def _fill_from_one(
             double[np.uint64(column * LANES + lane)] = number
 
 
-@_stage
+@stage
 def _fill_from_many(
     single: np.ndarray,
     double: np.ndarray,
@@ -98,7 +88,7 @@ def _fill_from_many(
             double[column * LANES + lane] = exact[at + np.uint64(column)]
 
 
-@_stage
+@stage
 def _distorted(
     single: np.ndarray, double: np.ndarray, pixels: np.ndarray, first: int, count: int, width: int
 ) -> None:
@@ -114,7 +104,7 @@ def _distorted(
         single[_XD + i], single[_YD + i] = np.float32(x), np.float32(y)
 
 
-@_stage
+@stage
 def _series(single: np.ndarray, count: int) -> None:
     """`rays._series`."""
     for i in range(count):
@@ -125,7 +115,7 @@ def _series(single: np.ndarray, count: int) -> None:
         single[_DY + i] = gain * y - u * p1
 
 
-@_stage
+@stage
 def _newton_step(single: np.ndarray, count: int, rational: bool) -> None:
     """`rays._newton_step` taken, and the radii out of its Jacobian."""
     for i in range(count):
@@ -156,7 +146,7 @@ def _newton_step(single: np.ndarray, count: int, rational: bool) -> None:
         single[_R + i] = (along_x + along_y) * inverse * _RADIUS
 
 
-@_stage
+@stage
 def _without_distortion(single: np.ndarray, count: int) -> None:
     """The displacement and the radii where no lens distorts."""
     for i in range(count):
@@ -164,7 +154,7 @@ def _without_distortion(single: np.ndarray, count: int) -> None:
         single[_R + i] = (single[_FX + i] + single[_FY + i]) * _RADIUS
 
 
-@_stage
+@stage
 def _turn(single: np.ndarray, double: np.ndarray, count: int) -> None:
     """The undistorted points turned into the canonical frame."""
     for i in range(count):
@@ -174,7 +164,7 @@ def _turn(single: np.ndarray, double: np.ndarray, count: int) -> None:
         single[_C + i] = np.float32(x * double[_R20 + i] + y * double[_R21 + i] + double[_R22 + i])
 
 
-@_stage
+@stage
 def _write_vectors(
     x: int, y: int, z: int, single: np.ndarray, first: int, count: int, out: np.ndarray
 ) -> None:
@@ -187,7 +177,7 @@ def _write_vectors(
         out[at + np.uint64(2)] = single[z + i]
 
 
-@_stage
+@stage
 def _normalise(single: np.ndarray, count: int) -> None:
     """Directions to length one."""
     for i in range(count):
@@ -196,11 +186,11 @@ def _normalise(single: np.ndarray, count: int) -> None:
         single[_A + i], single[_B + i], single[_C + i] = a * inverse, b * inverse, c * inverse
 
 
-_lower = _stage(lambda a, b: a if a < b else b)
-_higher = _stage(lambda a, b: a if a > b else b)
+_lower = stage(lambda a, b: a if a < b else b)
+_higher = stage(lambda a, b: a if a > b else b)
 
 
-@_stage
+@stage
 def _write_depths(
     single: np.ndarray, first: int, count: int, near: np.ndarray, far: np.ndarray, hit: np.ndarray
 ) -> None:
@@ -220,7 +210,7 @@ def _write_depths(
         hit[at] = meets
 
 
-@_stage
+@stage
 def _write_rest(
     single: np.ndarray, first: int, count: int, rgba: np.ndarray, radii: np.ndarray, colours: np.ndarray
 ) -> None:
@@ -232,7 +222,7 @@ def _write_rest(
         colours[at] = np.float32(rgba[at]) / _BYTE
 
 
-@_stage
+@stage
 def _write_indices(group: int, begin: int, end: int, indices: np.ndarray, out: np.ndarray) -> None:
     """Write the index of a group to its rays begin to end - 1."""
     index = indices[np.uint64(group)]
@@ -295,49 +285,14 @@ def _form(
         _write_rest(single, first, count, rgba, radii, colours)
 
 
-def _below(key: int, begin: int, limit: int, out: np.ndarray) -> None:
-    """`streams.below` for one limit, to out [count]."""
-    scale = float(limit)
-    for i in range(len(out)):
-        state = np.uint64(begin + 1 + i) * np.uint64(0x9E3779B97F4A7C15) + key
-        state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        state = state ^ (state >> np.uint64(31))
-        number = np.int64(np.float64(np.int64(state >> np.uint64(11))) * 2.0**-53 * scale)
-        out[i] = min(number, limit - 1)
-
-
-# Inputs that are not to be written to; arrays that may be are taken, too.
-_input = partial(types.Array, ndim=1, layout="C", readonly=True)
-_output = partial(types.Array, ndim=1, layout="C")
-
-
-def _compile(function: Callable[..., None], *arguments: types.Type) -> Callable[..., None]:
-    """Compile a function for arguments, or take what was compiled before."""
-    signature = types.void(*arguments)
-    try:
-        return numba.njit(signature, cache=True, **_OPTIONS)(function)
-    except (RuntimeError, OSError):
-        # No folder to keep it in can be written to, or the disk is full; then it is compiled each time.
-        return numba.njit(signature, **_OPTIONS)(function)
-
-
-_form_rays = _compile(
+_form_rays = compiled_for(
     _form,
-    *(_input(types.float64), _input(types.float32), types.int64, types.boolean, types.int64),
-    *[_input(types.int64)] * 4,
-    *(types.int64, _input(types.uint8)),
-    *[_output(types.float32)] * 7,
-    *(_output(types.int64), _output(types.int64), _output(types.boolean)),
+    *(input_of(types.float64), input_of(types.float32), types.int64, types.boolean, types.int64),
+    *[input_of(types.int64)] * 4,
+    *(types.int64, input_of(types.uint8)),
+    *[output_of(types.float32)] * 7,
+    *(output_of(types.int64), output_of(types.int64), output_of(types.boolean)),
 )
-_draw_below = _compile(_below, types.uint64, types.int64, types.int64, _output(types.int64))
-
-
-def below(key: int, begin: int, count: int, limit: int) -> np.ndarray:
-    """`preface.shards.streams.below` for one limit."""
-    out = np.empty(count, np.int64)
-    _draw_below(key, begin, limit, out)
-    return out
 
 
 class CompiledTable:

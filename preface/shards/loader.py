@@ -187,15 +187,15 @@ class Loader:
         self._table = dataset.ray_table(scale, rays_on)
         self._sampler, self._views = sampler, dataset.manifest.views
         self._rank, self._world = rank, world
-        kernels, self.route = self._choose_route(compiled)
-        self._compiled = kernels.CompiledTable(self._table) if kernels else None
+        rays, _, self.route = self._choose_route(compiled)
+        self._compiled = rays.CompiledTable(self._table) if rays else None
 
     def _choose_route(self, compiled: bool) -> Route:
         """Choose between torch, which runs anywhere, and what is compiled for processors."""
         if not compiled:
-            return Route(None, "torch (asked for)")
+            return Route(None, None, "torch (asked for)")
         if self._table.device.type != "cpu":
-            return Route(None, f"torch (on {self._table.device})")
+            return Route(None, None, f"torch (on {self._table.device})")
         return fastest_route()
 
     def batch(self, step: int) -> Batch:

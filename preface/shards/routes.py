@@ -16,11 +16,13 @@ class Route(NamedTuple):
     """A way to form batches.
 
     Attributes:
-        kernels: `preface.shards.compiled`, None without numba.
+        rays: `preface.shards.compiled`, None without numba.
+        draws: `preface.shards.compiled_draws`, None without numba.
         name: "compiled by numba <version>", or "torch" and why not the other.
     """
 
-    kernels: ModuleType | None
+    rays: ModuleType | None
+    draws: ModuleType | None
     name: str
 
 
@@ -29,6 +31,7 @@ def fastest_route() -> Route:
     """The route of this installation, found out once."""
     try:
         numba = import_module("numba")
-        return Route(import_module("preface.shards.compiled"), f"compiled by numba {numba.__version__}")
+        rays, draws = (import_module(f"preface.shards.{name}") for name in ("compiled", "compiled_draws"))
+        return Route(rays, draws, f"compiled by numba {numba.__version__}")
     except ImportError as error:  # also of a numba that does not go with this numpy
-        return Route(None, f"torch ({error})")
+        return Route(None, None, f"torch ({error})")

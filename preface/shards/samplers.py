@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from preface.shards.format import PixelOrder
-from preface.shards.streams import below, permutation, stream_key, without_replacement
+from preface.shards.streams import below, compiled_draws, permutation, stream_key, without_replacement
 
 # What the streams of a step are for; part of what makes a run repeatable, so never renumbered.
 _IDENTITIES, _VIEWS, _PIXELS, _CHOICE = 1, 2, 3, 4
@@ -152,12 +152,6 @@ class PaperPattern:
         return Pick(identity, view, permutation(total)[0][slot], slot)
 
 
-def _divided(numbers: np.ndarray, divisor: int) -> tuple[np.ndarray, np.ndarray]:
-    """Quotients and remainders of int64 [n], none negative, in a tenth of the time of `np.divmod`."""
-    quotients = numbers // divisor
-    return quotients, numbers - quotients * divisor
-
-
 @dataclass(frozen=True, eq=False)
 class SingleRays:
     """Rays of single heads: each uniform over all pixels of all valid views, or over foreground boxes.
@@ -198,10 +192,9 @@ class SingleRays:
 
     @cached_property
     def _boxes(self) -> np.ndarray:
-        """Left, top and width of the valid views' foreground boxes, and the area of those before, int64 [4, n]."""
-        x0, y0, x1, y1 = self.index.foreground_box[tuple(self._columns)].astype(np.int64).T
-        areas = (x1 - x0) * (y1 - y0)
-        return np.stack([x0, y0, x1 - x0, np.cumsum(areas) - areas])
+        """Left, top and width of the valid views' foreground boxes, int64 [3, n]."""
+        x0, y0, x1, _ = self.index.foreground_box[tuple(self._columns)].astype(np.int64).T
+        return np.stack([x0, y0, x1 - x0])
 
     @cached_property
     def _areas(self) -> np.ndarray:
@@ -212,29 +205,58 @@ class SingleRays:
     def pick(self, step: int, rank: int, world: int) -> Pick:
         """Draw the groups of a rank."""
         begin, end = groups_of(rank, world, self.groups)
-        key = stream_key(self.seed, step, _PIXELS)
-        total = self.index.width * self.index.height
-        pair, pixel = _divided(below(key, begin, end - begin, len(self.index.pairs) * total), total)
-        if self.foreground_share > 0:
-            pair, pixel = self._with_foreground(step, begin, pair, pixel)
-        identity, view = (column[pair] for column in self._columns)
+        draws = compiled_draws(end - begin)
+        draw = draws.single_rays if draws else single_rays_by_numpy
+        uniform, chance, boxed = (stream_key(self.seed, step, word) for word in (_PIXELS, _CHOICE, _VIEWS))
+        pair, pixel = draw(
+            (uniform, chance, boxed),
+            round(self.foreground_share * 2**53),
+            begin,
+            end - begin,
+            (self.index.width, self.index.height),
+            self._boxes,
+            self._areas,
+        )
+        identity, view = self._columns.take(pair, axis=1)
         return self.index.pick(identity, view, pixel[:, None])
 
-    def _with_foreground(
-        self, step: int, begin: int, pair: np.ndarray, pixel: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Put draws from the foreground boxes in the place of that share of the draws."""
-        count = len(pair)
-        chance = below(stream_key(self.seed, step, _CHOICE), begin, count, 2**53)
-        chosen = np.flatnonzero(chance < round(self.foreground_share * 2**53))
-        positions = below(stream_key(self.seed, step, _VIEWS), begin, count, int(self._areas[-1]))[chosen]
-        boxed = np.searchsorted(self._areas, positions, side="right")
-        left, top, width, before = (column[boxed] for column in self._boxes)
-        within = positions - before
-        down = within // width
-        pair[chosen] = boxed
-        pixel[chosen] = (top + down) * self.index.width + left + within - down * width
-        return pair, pixel
+
+def single_rays_by_numpy(
+    keys: tuple[int, int, int],
+    bound: int,
+    begin: int,
+    count: int,
+    size: tuple[int, int],
+    boxes: np.ndarray,
+    areas: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """What `SingleRays` draws, by numpy, which runs anywhere; `compiled_draws.single_rays` is the compiled twin.
+
+    Args:
+        keys: of the streams of pixels, of chance, and of places within the boxes.
+        bound: a ray is drawn from the boxes if its number of chance, of 53 bits, is below.
+        begin, count: the first ray, and how many.
+        size: width and height of the views.
+        boxes: int64 [3, n], left, top and width of the views' foreground boxes.
+        areas: int64 [n], the area of each box and those before.
+
+    Returns:
+        The views' numbers and raster pixels, int64 [count] each.
+    """
+    uniform, chance, boxed = keys
+    width, height = size
+    number = below(uniform, begin, count, len(areas) * width * height)
+    pair = number // (width * height)
+    pixel = number - pair * (width * height)  # in a tenth of the time of `np.divmod`
+    if bound > 0:
+        chosen = np.flatnonzero(below(chance, begin, count, 2**53) < bound)
+        number = below(boxed, begin, count, int(areas[-1]))[chosen]
+        pair[chosen] = box = np.searchsorted(areas, number, side="right")
+        left, top, across = boxes[:, box]
+        within = number - np.concatenate([[0], areas])[box]
+        down = within // across
+        pixel[chosen] = (top + down) * width + left + within - down * across
+    return pair, pixel
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ of the format and never changes.
 from __future__ import annotations
 
 from functools import lru_cache
+from types import ModuleType
 
 import numpy as np
 
@@ -49,10 +50,15 @@ def bits(key: int, begin: int, count: int) -> np.ndarray:
     return state
 
 
+def compiled_draws(count: int) -> ModuleType | None:
+    """`preface.shards.compiled_draws` if it is there and worth its import for so many numbers."""
+    return fastest_route().draws if count >= _WORTH_COMPILING else None
+
+
 def below(key: int, begin: int, count: int, limit: np.ndarray | int) -> np.ndarray:
     """Whole numbers in [0, limit), int64 [count], from 53 bits each; the limits [count] are at most 2^53."""
-    if count >= _WORTH_COMPILING and isinstance(limit, int) and (kernels := fastest_route().kernels):
-        return kernels.below(key, begin, count, limit)
+    if isinstance(limit, int) and (draws := compiled_draws(count)):
+        return draws.below(key, begin, count, limit)
     return below_by_numpy(key, begin, count, limit)
 
 

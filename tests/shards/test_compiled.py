@@ -10,8 +10,9 @@ from numba import types
 
 from preface.geometry import Camera, Rigid, Views
 from preface.geometry.transforms import nearest_rotation
-from preface.shards import Dataset, Loader, PaperPattern, SingleRays, compiled
+from preface.shards import Dataset, Loader, PaperPattern, SingleRays, compiled, compiled_draws
 from preface.shards.batches import form_batch
+from preface.shards.compiling import compiled_for
 from preface.shards.rays import RayTable
 
 WIDTH, HEIGHT = 48, 36
@@ -145,8 +146,8 @@ def test_arrays_that_do_not_fit_are_refused_before_memory_is_read():
 def test_without_a_folder_to_keep_the_code_in_it_is_compiled_anew(monkeypatch):
     monkeypatch.setattr("numba.core.caching.CacheImpl._locator_classes", [])
     with pytest.raises(RuntimeError, match="no locator"):
-        numba.njit(compiled._below, cache=True)
+        numba.njit(compiled_draws._below, cache=True)
     signature = (types.uint64, types.int64, types.int64, types.Array(types.int64, 1, "C"))
     drawn = np.empty(5, np.int64)
-    compiled._compile(compiled._below, *signature)(7, 0, 100, drawn)
-    assert drawn.tolist() == compiled.below(7, 0, 5, 100).tolist()
+    compiled_for(compiled_draws._below, *signature)(7, 0, 100, drawn)
+    assert drawn.tolist() == compiled_draws.below(7, 0, 5, 100).tolist()

@@ -6,7 +6,9 @@ import torch
 from small_heads import HEIGHT, NAMES, WIDTH
 
 from preface.artifacts import ArtifactError
-from preface.shards import Dataset, Loader, PaperPattern, Patches, SingleRays, ViewIndex
+from preface.shards import Dataset, Loader, PaperPattern, Patches, SingleRays, ViewIndex, compiled_draws
+from preface.shards.samplers import single_rays_by_numpy
+from preface.shards.streams import below
 
 VALID = np.arange(70 * 5).reshape(70, 5) % 7 != 3
 BOXES = np.tile([2, 3, 9, 14], (70, 5, 1))
@@ -120,6 +122,33 @@ def test_foreground_draws_are_uniform_over_boxes_of_any_size():
     counts = np.bincount(pick.view * 384 + pick.pixel[:, 0], minlength=768)
     assert np.count_nonzero(counts) == 4 + 24
     assert np.abs(counts[counts > 0] - 1000).max() < 5 * np.sqrt(1000)
+
+
+@pytest.mark.parametrize("draw", [compiled_draws.single_rays, single_rays_by_numpy])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("views", [1, 2, 5, 18])
+def test_single_rays_are_pixels_by_their_number_among_all_or_among_those_of_the_boxes(draw, share, views):
+    width, height, begin, count, bound = 7, 5, 11, 3000, round(share * 2**53)
+    rng = np.random.default_rng(views)
+    corners = np.sort(rng.integers(0, 6, (views, 2, 2)), axis=1).reshape(
+        views, 4
+    )  # x0 y0 x1 y1, some of them empty
+    corners[-1] = [0, 0, 2, 5]
+    boxes = np.array([corners[:, 0], corners[:, 1], corners[:, 2] - corners[:, 0]])
+    within = [[y * width + x for y in range(y0, y1) for x in range(x0, x1)] for x0, y0, x1, y1 in corners]
+    areas = np.cumsum([len(pixels) for pixels in within])
+    everywhere = [(view, pixel) for view in range(views) for pixel in range(width * height)]
+    inside = [(view, pixel) for view in range(views) for pixel in within[view]]
+
+    keys = (91, 92, 93)
+    uniform, chance, boxed = (
+        below(key, begin, count, limit)
+        for key, limit in zip(keys, (len(everywhere), 2**53, len(inside)), strict=True)
+    )
+    numbers = zip(uniform, chance, boxed, strict=True)
+    expected = [inside[b] if c < bound else everywhere[u] for u, c, b in numbers]
+    found = draw(keys, bound, begin, count, (width, height), boxes, areas)
+    assert np.array_equal(np.stack(found, axis=1), expected)
 
 
 def test_patches_are_squares_of_neighbours():

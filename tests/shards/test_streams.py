@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from preface.shards import compiled
+from preface.shards import compiled_draws
 from preface.shards.streams import (
     below,
     below_by_numpy,
@@ -43,7 +43,7 @@ def test_compiled_and_numpys_numbers_are_those_of_whole_arithmetic(limit):
     # floor(number / 2^53 * limit), where the product is rounded to a float64; in whole numbers of Python.
     numbers = [mix64((key + (begin + 1 + i) * 0x9E3779B97F4A7C15) % 2**64) >> 11 for i in range(3000)]
     expected = [min(int(float(n * limit) / 2**53), limit - 1) for n in numbers]
-    assert compiled.below(key, begin, 3000, limit).tolist() == expected
+    assert compiled_draws.below(key, begin, 3000, limit).tolist() == expected
     assert below_by_numpy(key, begin, 3000, limit).tolist() == expected
     assert below(key, begin, 3000, limit).tolist() == expected
     assert below(key, begin, 3, limit).tolist() == expected[:3]

@@ -196,6 +196,7 @@ def measure_stages(path: Path, size: tuple[int, int], repeats: int) -> dict[str,
         bytes=lambda: bytes_of_light(values),
         colors=lambda: plan.colors(pixels),
         coverage=lambda: plan.coverage(alpha),
+        foreground=lambda: plan.foreground(pixels, alpha),
     )
     return {
         "picture": f"{path.name} ({width}x{height} {pixels.dtype})",
@@ -207,6 +208,7 @@ def measure_stages(path: Path, size: tuple[int, int], repeats: int) -> dict[str,
         "to bytes": took["bytes"],
         "(read_image + colors) / bare decode": round((took["read"] + took["colors"]) / took["bare"], 2),
         "coverage of a float mask": took["coverage"],
+        "colours, coverage and edges by a float mask": took["foreground"],
     }
 
 

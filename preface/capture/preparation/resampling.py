@@ -93,7 +93,7 @@ class Resampler:
         """
         pixels = self._checked("pixels", pixels, (1, 3, 4))
         read = reader(pixels.dtype, self.options.light, self.options.white)
-        values, shares = self._filtered(pixels if pixels.shape[2] < 4 else _without_alpha(pixels), read)
+        values, shares = self._filtered(read, pixels if pixels.shape[2] < 4 else _without_alpha(pixels))
         if shares is not None:
             values /= np.maximum(shares, _SHOWN)
             values *= shares > _SHOWN
@@ -116,18 +116,16 @@ class Resampler:
         Raises:
             PreparationError: as `colors` and `coverage`.
         """
-        colors, coverage = self.colors(pixels), self.coverage(alpha)
-        shown = coverage > 0
-        if not shown.any() or (alpha == alpha.max()).all():
-            return colors, coverage
-        both = _with_alpha(self._checked("pixels", pixels, (1, 3, 4)), alpha)
-        channels = both.shape[2]
-        read = premultiplied_reader(both.dtype, self.options.light, self.options.white, channels)
-        values, _ = self._filtered(both, read)
-        values, shares = values[..., :-1], values[..., -1:]
-        shown &= shares[..., 0] > _SHOWN  # of a filter with negative lobes, all may cancel out
+        colors, _ = split_alpha(self._checked("pixels", pixels, (1, 3, 4)))
+        alpha = self._checked("alpha", alpha, (1,))
+        mixed, shares = self.colors(colors), self._shares(alpha)
+        coverage = bytes_of_values(shares[..., 0])
+        if not coverage.any() or (alpha == alpha.max()).all():
+            return mixed, coverage
+        read = reader(colors.dtype, self.options.light, self.options.white)
+        values, _ = self._filtered(premultiplied_reader(read, _alphas(alpha)), colors, alpha)
         unmixed = self._bytes(values / np.maximum(shares, _SHOWN))
-        return np.where(shown[..., None], unmixed, colors), coverage
+        return np.where(coverage[..., None] > 0, unmixed, mixed), coverage
 
     def _bytes(self, values: np.ndarray) -> np.ndarray:
         coded = bytes_of_light(values) if self.options.light == "linear" else bytes_of_values(values)
@@ -146,12 +144,14 @@ class Resampler:
         Raises:
             PreparationError: another size or type, or values that are not in [0, 1].
         """
-        alpha = self._checked("alpha", alpha, (1,))
+        return bytes_of_values(self._shares(self._checked("alpha", alpha, (1,)))[..., 0])
+
+    def _shares(self, alpha: np.ndarray) -> np.ndarray:
+        """What `coverage` rounds, float32 [H, W, 1], of an alpha [h, w, 1]."""
         if alpha.dtype.kind == "f" and not ((alpha >= 0) & (alpha <= LARGEST_ALPHA)).all():
             problem = f"has values from {alpha.min()} to {alpha.max()}"
             raise PreparationError("alpha", problem, "give shares from 0 to 1")
-        values, _ = self._filtered(alpha, reader(alpha.dtype, "alpha", 1.0))
-        return bytes_of_values(values[..., 0])
+        return self._filtered(_alphas(alpha), alpha)[0]
 
     def describe(self) -> dict[str, Any]:
         """What is done, as plain JSON values, for a manifest."""
@@ -184,10 +184,10 @@ class Resampler:
         distorts = bool(self.camera.intrinsics[4:].any())
         return distorts and (folds or self.options.undistort == "resample")
 
-    def _filtered(self, pixels: np.ndarray, read: Reader) -> tuple[np.ndarray, np.ndarray | None]:
+    def _filtered(self, read: Reader, *sources: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         if isinstance(self._apply, Pinhole):
-            return self._apply(pixels, read)
-        return self._apply(pixels, read), None
+            return self._apply(read, *sources)
+        return self._apply(read, *sources), None
 
     def _checked(self, field: str, pixels: np.ndarray, channels: tuple[int, ...]) -> np.ndarray:
         """The picture as [h, w, c], contiguous.
@@ -218,15 +218,8 @@ def split_alpha(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     return pixels, None
 
 
-def _with_alpha(pixels: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Colours [h, w, c] and alpha [h, w] as one image of the colours' type; an alpha of their own is replaced."""
-    given = alpha.reshape(*pixels.shape[:2], 1)
-    if given.dtype != pixels.dtype:
-        share = given / np.float32(np.iinfo(given.dtype).max) if given.dtype.kind in "u" else given
-        most = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
-        scaled = np.clip(share, 0, 1) * np.float32(most)
-        given = (np.rint(scaled) if most > 1 else scaled).astype(pixels.dtype)
-    return np.concatenate([pixels[..., : 3 if pixels.shape[2] > 1 else 1], given], axis=-1)
+def _alphas(alpha: np.ndarray) -> Reader:
+    return reader(alpha.dtype, "alpha", 1.0)
 
 
 def _without_alpha(pixels: np.ndarray) -> np.ndarray:

@@ -71,23 +71,26 @@ class Separable:
         self._columns, self._across = across.compact()
         self._plans: dict[int, _Plan] = {}
 
-    def __call__(self, source: np.ndarray, read: Reader) -> np.ndarray:
+    def __call__(self, read: Reader, *sources: np.ndarray) -> np.ndarray:
         """Filter an image.
 
         Args:
-            source: [h, w, c] of any type that ``read`` reads, contiguous but for its rows' distance.
-            read: turns rows into float32, see `preface.capture.preparation.transfer.reader`.
+            read: turns rows, one array of them per source, into float32; see
+                `preface.capture.preparation.transfer.reader`.
+            sources: [h, w, c] of any type that ``read`` reads, contiguous but for its rows' distance; the first one
+                has the channels of what is read.
 
         Returns:
             float32 [H, W, c].
         """
-        channels = source.shape[2]
+        channels = sources[0].shape[2]
         height, width = self._down.count, self._across.count
         bands, blocks, most = self._plan(channels)
-        lines = _lines(_taken(_taken(source, self._rows, 0), self._columns, 1))
+        lines = [_lines(_taken(_taken(source, self._rows, 0), self._columns, 1)) for source in sources]
+        length = lines[0].shape[1]
         result = np.empty((height, width * channels), np.float32)
-        sums = np.empty((min(_BAND, height), lines.shape[1]), np.float32)
-        light = np.empty((most, lines.shape[1]), np.float32)
+        sums = np.empty((min(_BAND, height), length), np.float32)
+        light = np.empty((most, length), np.float32)
         for begin, band in zip(range(0, height, _BAND), bands, strict=True):
             for step in band:
                 _add_up(lines, read, step, light, sums)
@@ -108,10 +111,10 @@ class Separable:
         return self._plans[channels]
 
 
-def _add_up(lines: np.ndarray, read: Reader, step: _Step, light: np.ndarray, sums: np.ndarray) -> None:
+def _add_up(lines: list[np.ndarray], read: Reader, step: _Step, light: np.ndarray, sums: np.ndarray) -> None:
     """Read the rows of one step and add what the rows of the band take from them."""
     rows = light[: step.high - step.low]
-    read(lines[step.low : step.high], rows)
+    read(*(source[step.low : step.high] for source in lines), rows)
     for product in step.products:
         taken, into = rows[product.low : product.high], sums[product.begin : product.end]
         if product.more:

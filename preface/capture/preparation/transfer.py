@@ -24,7 +24,7 @@ _STEPS = 4096
 DTYPES = (np.uint8, np.uint16, np.float16, np.float32)
 LARGEST_ALPHA = 1 + 1e-3  # a half float's rounding above 1
 
-Reader = Callable[[np.ndarray, np.ndarray], object]  # what it returns is of no interest
+Reader = Callable[..., object]  # what it returns is of no interest
 
 
 @dataclass(frozen=True)
@@ -68,22 +68,21 @@ def reader(dtype: np.dtype, meaning: Light | Literal["alpha"], white: float) -> 
     return lambda rows, out: np.take(table, rows, out=out, mode="clip")
 
 
-def premultiplied_reader(dtype: np.dtype, meaning: Light, white: float, channels: int) -> Reader:
-    """As `reader`, of images whose last channel is an alpha: colours times it, and the alpha itself.
+def premultiplied_reader(colors: Reader, alphas: Reader) -> Reader:
+    """How rows of an image are read with those of its alpha: ``read(rows, alpha, out)`` writes their product.
 
     Args:
-        dtype, meaning, white: as `reader` takes them; the meaning is that of the colours.
-        channels: of the image, with the alpha.
+        colors, alphas: how either is read.
     """
-    colors, alphas = reader(dtype, meaning, white), reader(dtype, "alpha", white)
 
-    def read(rows: np.ndarray, out: np.ndarray) -> None:
+    def read(rows: np.ndarray, alpha: np.ndarray, out: np.ndarray) -> None:
+        import cv2
+
         colors(rows, out)
-        taken, into = (x.reshape(len(x), -1, channels) if x.ndim == 2 else x for x in (rows, out))
-        alpha = np.empty(into.shape[:2], np.float32)
-        alphas(taken[..., -1], alpha)
-        into[..., :-1] *= alpha[..., None]
-        into[..., -1] = alpha
+        shares = np.empty(alpha.shape[:2], np.float32)
+        alphas(alpha.reshape(shares.shape), shares)
+        into = out.reshape(*shares.shape, -1)
+        into *= cv2.cvtColor(shares, cv2.COLOR_GRAY2RGB) if into.shape[2] == 3 else shares[..., None]
 
     return read
 

@@ -102,42 +102,48 @@ class Pinhole:
         across = axis(filter, fine.width, 0.0, fine.width, pinhole.width)
         self._bands = [_band(down, across, begin) for begin in range(0, pinhole.height, _BAND)]
 
-    def __call__(self, pixels: np.ndarray, read: Reader) -> tuple[np.ndarray, np.ndarray | None]:
+    def __call__(self, read: Reader, *sources: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """Resample a photograph.
 
         Args:
-            pixels: [h, w, c] of any type that ``read`` reads.
-            read: turns rows into float32.
+            read: turns rows, one array of them per source, into float32.
+            sources: [h, w, c] of any type that ``read`` reads; the first one has the channels of what is read.
 
         Returns:
             float32 [H, W, c], the sum over what a pixel shows of the photograph; and float32 [H, W, 1], the
             share of the pixel that shows it, None where all of all pixels does.
         """
-        sums = np.empty((*self._size, pixels.shape[2]), np.float32)
+        sums = np.empty((*self._size, sources[0].shape[2]), np.float32)
         shares = None if self.covered else np.empty((*self._size, 1), np.float32)
         for band in self._bands:
             x, y, valid = self._places.rows(band.low, band.high)
-            fine = self._remapped(pixels, read, x, y, valid)
-            sums[band.begin : band.end] = band.filter(fine, as_they_are)
+            fine = self._remapped(sources, read, x, y, valid)
+            sums[band.begin : band.end] = band.filter(as_they_are, fine)
             if shares is not None:
                 weight = np.ones((*x.shape, 1), np.float32) if valid is None else valid[..., None]
-                shares[band.begin : band.end] = band.filter(weight.astype(np.float32), as_they_are)
+                shares[band.begin : band.end] = band.filter(as_they_are, weight.astype(np.float32))
         return sums, shares
 
     def _remapped(
-        self, pixels: np.ndarray, read: Reader, x: np.ndarray, y: np.ndarray, valid: np.ndarray | None
+        self,
+        sources: tuple[np.ndarray, ...],
+        read: Reader,
+        x: np.ndarray,
+        y: np.ndarray,
+        valid: np.ndarray | None,
     ) -> np.ndarray:
         """The photograph at places [n, m], float32 [n, m, c]; 0 where they are not valid."""
         import cv2
 
+        channels = sources[0].shape[2]
         seen = y if valid is None else y[valid]
         if not seen.size:
-            return np.zeros((*x.shape, pixels.shape[2]), np.float32)
+            return np.zeros((*x.shape, channels), np.float32)
         reduction = self._route.reduction
         most = -(-self._source.height // reduction)
         low = max(0, int(seen.min() / reduction) - _REACH)
         high = min(most, int(seen.max() / reduction) + 1 + _REACH)
-        part = _reduced(pixels, read, reduction, low, high)
+        part = _reduced(sources, read, reduction, low, high)
         kernel = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos4": cv2.INTER_LANCZOS4}
         scale = np.float32(1 / reduction)
         fine = cv2.remap(
@@ -146,7 +152,7 @@ class Pinhole:
             pixels_to_opencv(y * scale - np.float32(low)),
             kernel[self._route.kernel],
             borderMode=cv2.BORDER_REPLICATE,
-        ).reshape(*x.shape, pixels.shape[2])
+        ).reshape(*x.shape, channels)
         if valid is not None:
             fine *= valid[..., None]
         return fine
@@ -159,24 +165,27 @@ def _band(down: Axis, across: Axis, begin: int) -> _Band:
     return _Band(begin, end, low, high, Separable(rows, across))
 
 
-def _reduced(pixels: np.ndarray, read: Reader, reduction: int, low: int, high: int) -> np.ndarray:
+def _reduced(
+    sources: tuple[np.ndarray, ...], read: Reader, reduction: int, low: int, high: int
+) -> np.ndarray:
     """Rows low to high of the photograph reduced by area, float32 [high - low, w / reduction rounded up, c].
 
     The last row and column stand in for those that a reduction past the border lacks.
     """
     import cv2
 
-    width, channels = pixels.shape[1:]
+    width, channels = sources[0].shape[1:]
     columns = -(-width // reduction)
     part = np.empty((high - low, columns, channels), np.float32)
     light = np.empty((_READ_ROWS * reduction, columns * reduction, channels), np.float32)
     for begin in range(low, high, _READ_ROWS):
         end = min(begin + _READ_ROWS, high)
         rows = light[: (end - begin) * reduction]
-        there = pixels[begin * reduction : end * reduction]
-        read(there, rows[: len(there), :width])
-        rows[: len(there), width:] = rows[: len(there), width - 1 : width]
-        rows[len(there) :] = rows[len(there) - 1]
+        there = [source[begin * reduction : end * reduction] for source in sources]
+        count = len(there[0])
+        read(*there, rows[:count, :width])
+        rows[:count, width:] = rows[:count, width - 1 : width]
+        rows[count:] = rows[count - 1]
         into = part[begin - low : end - low]
         if reduction == 1:
             into[...] = rows

@@ -113,7 +113,7 @@ def test_two_axes_at_once_equal_their_full_matrices(filter, down, across, channe
     )
     with pytest.MonkeyPatch.context() as patch:  # small steps: rows that are added up over many of them
         patch.setattr("preface.capture.preparation.separable._STEP_BYTES", step)
-        found = Separable(axis(filter, *down), axis(filter, *across))(source, as_they_are)
+        found = Separable(axis(filter, *down), axis(filter, *across))(as_they_are, source)
     np.testing.assert_allclose(found, wanted, atol=3e-6)
 
 
@@ -125,6 +125,6 @@ def test_every_row_is_read_once_for_filters_that_reach_far():
         np.copyto(out, rows)
 
     source = np.zeros((900, 4000, 3), np.float32)
-    Separable(axis("lanczos", 900, 0.0, 900.0, 30), axis("lanczos", 4000, 0.0, 4000.0, 100))(source, read)
+    Separable(axis("lanczos", 900, 0.0, 900.0, 30), axis("lanczos", 4000, 0.0, 4000.0, 100))(read, source)
     assert sum(rows_read) == 900
     assert max(rows_read) * 4000 * 3 * 4 <= 2**20  # and only a few at a time

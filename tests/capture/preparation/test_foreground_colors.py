@@ -34,15 +34,26 @@ def test_a_screen_leaves_no_trace_in_pixels_that_show_any_foreground(camera, lig
     assert np.abs(colors[coverage == 0].astype(int) - SCREEN).max() <= 1
 
 
-def test_the_mean_is_weighted_by_alpha():
+MASKS = {
+    "bytes": lambda rng: rng.integers(0, 256, (80, 60), np.uint8),
+    "shares": lambda rng: rng.uniform(0, 1, (80, 60)).astype(np.float32),
+    # Most of them are less than half a byte, and count all the same.
+    "faint shares": lambda rng: rng.uniform(0, 0.004, (80, 60, 1)).astype(np.float32),
+}
+
+
+@pytest.mark.parametrize("mask", MASKS)
+def test_the_mean_is_weighted_by_alpha(mask):
     rng = np.random.default_rng(1)
-    pixels, alpha = rng.integers(0, 256, (80, 60, 3), np.uint8), rng.integers(0, 256, (80, 60), np.uint8)
+    pixels, alpha = rng.integers(0, 256, (80, 60, 3), np.uint8), MASKS[mask](rng)
     colors, coverage = planned(PLAIN, light="encoded").foreground(pixels, alpha)
-    weights = alpha.reshape(20, 4, 15, 4).astype(np.float64)
+    weights = alpha.reshape(20, 4, 15, 4).astype(np.float64) / (255 if alpha.dtype == np.uint8 else 1)
     values = pixels.reshape(20, 4, 15, 4, 3).astype(np.float64)
     wanted = np.einsum("iajb,iajbc->ijc", weights, values) / weights.sum(axis=(1, 3))[..., None]
-    assert np.abs(colors - wanted).max() <= 0.5 + 1e-3
-    assert np.abs(coverage - weights.mean(axis=(1, 3))).max() <= 0.5 + 1e-3
+    shown = coverage > 0
+    assert shown.sum() > 50
+    assert np.abs(colors - wanted)[shown].max() <= 0.5 + 1e-3
+    assert np.abs(coverage - 255 * weights.mean(axis=(1, 3))).max() <= 0.5 + 1e-3
 
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.float16, np.float32])
