@@ -1,4 +1,6 @@
-"""What is wrong with a JSON value, in words for people who have never seen a JSON Schema."""
+"""Values in words for people: numbers of things, room on a disk, and what is wrong with a JSON value for those who have
+never seen a JSON Schema.
+"""
 
 import difflib
 import json
@@ -25,6 +27,21 @@ _BOUNDS = {
     "minItems": "at least",
     "maxItems": "at most",
 }
+
+MAX_CHOICES = 12  # named in a remedy; the rest are counted
+
+
+def counted(count: int, one: str, many: str) -> str:
+    """A number of things: ``counted(1, "identity", "identities")`` is "1 identity"."""
+    return f"{count:,} {one if count == 1 else many}"
+
+
+def disk_space(count: float) -> str:
+    """A number of bytes in the unit that suits it: "9.2 kB", "34.5 MB"."""
+    for unit, of_unit in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if count >= of_unit:
+            return f"{count / of_unit:.1f} {unit}"
+    return f"{count / 1e3:.1f} kB"
 
 
 def in_plain_words(error: "ValidationError") -> tuple[str, str, str]:
@@ -95,7 +112,10 @@ def shown(value: Any) -> str:
 
 
 def suggestion(value: Any, choices: Iterable[str]) -> str:
-    """A remedy: the closest of ``choices``, or all of them."""
+    """A remedy: the closest of ``choices``, or the first of them; a prior knows more than a thousand people."""
     choices = list(choices)
     close = difflib.get_close_matches(str(value), choices, n=1)
-    return f"Perhaps '{close[0]}' was meant" if close else f"Choose one of {', '.join(choices)}"
+    if close:
+        return f"Perhaps '{close[0]}' was meant"
+    more = f", ... and {len(choices) - MAX_CHOICES:,} more" if len(choices) > MAX_CHOICES else ""
+    return f"Choose one of {', '.join(choices[:MAX_CHOICES])}{more}"

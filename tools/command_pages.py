@@ -15,8 +15,10 @@ from pathlib import Path
 
 from command_flags import Command, Flag, Section, default_of_each, of_fields, of_parser
 from command_tours import TOURS, Tour
-from preface.artifacts import ArtifactError, write_bytes
+from preface.artifacts import write_bytes
 from preface.cli import fit, train
+from preface.cli.folders import make_folder
+from preface.cli.output import exit_status
 from preface.model.fitting.configuration import QUALITIES as FIT_QUALITIES
 from preface.model.rendering import shortcuts
 from preface.model.training.configuration import TRAINING_PRESETS
@@ -33,18 +35,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser("command_pages", description="Write a page per command.")
     parser.add_argument("--output", type=Path, default=PAGES, help="folder (default: docs/commands)")
     folder = parser.parse_args(arguments).output
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+
+    def run() -> list[str]:
+        make_folder(folder)
         for name, text in pages().items():
             write_bytes(folder / name, text.encode())
-    except OSError as error:
-        print(ArtifactError.from_os(folder, "writing", error), file=sys.stderr)
-        return 1
-    except ArtifactError as error:
-        print(error, file=sys.stderr)
-        return 1
-    print(folder)
-    return 0
+        return [str(folder)]
+
+    return exit_status(run, parser, folder)
 
 
 def scripts() -> dict[str, Callable[[list[str]], int]]:

@@ -36,11 +36,17 @@ if $pretrained; then
 else
     out=${OUTPUT:-demo_output}
     prior=$out/prior
-    people=13 # the last of them is fitted
+    people=13
     studio=(--identities "$people")
-    fitted=id0012
+    fitted=$(printf 'id%04d' $((people - 1))) # the last of them
     minutes=(1.8 0.1 0.5 1.2 0.7 2.2 0.9 0.7 0.4 0.6 0.3)
 fi
+views=(cam04 cam05)
+quality=draft
+# Without a prior there is nothing to invert: the same number of steps, inversion's among them, all finetune.
+steps=$($bin/python -c 'import sys; from preface.model.fitting.configuration import defaults
+inversion, finetuning, _ = defaults(sys.argv[1])
+print(inversion.steps + finetuning.steps)' "$quality")
 mkdir -p "$out"
 number=0
 
@@ -88,11 +94,10 @@ stage "shards" $bin/preface-build-shards "$out/capture" --rig "$out" --alignment
 if ! $pretrained; then
     stage "prior" $bin/preface-train "$out/shards" --preset tiny --identities $((people - 1)) --output "$prior"
 fi
-stage "fit" $bin/preface-fit "$out/shards" --prior "$prior" --identity "$fitted" --views cam04 cam05 \
-    --quality draft --output "$out/head"
-# The same architecture for as many steps, inversion's among them.
+stage "fit" $bin/preface-fit "$out/shards" --prior "$prior" --identity "$fitted" --views "${views[@]}" \
+    --quality "$quality" --output "$out/head"
 stage "fit without a prior" $bin/preface-fit "$out/shards" --prior none --like "$prior" --identity "$fitted" \
-    --views cam04 cam05 --quality draft --finetuning.steps 240 --output "$out/head-without-prior"
+    --views "${views[@]}" --quality "$quality" --finetuning.steps "$steps" --output "$out/head-without-prior"
 stage "orbit" $bin/preface-render "$out/head" --orbit 24 --video --no-exr --output "$out/renders"
 stage "evaluation" $bin/preface-evaluate "$out/head" "$out/head-without-prior" --shards "$out/shards" \
     --output "$out/evaluation"

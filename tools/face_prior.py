@@ -9,19 +9,16 @@ whole is scaled once so that the mean distance of the irises is the human one.
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
-sys.path.insert(0, str(Path(__file__).parent))
-
 from preface.align.keypoints import CANONICAL_KEYPOINTS, SCHEMES
 from preface.geometry import fit_similarity
 from synthetic_studio.eyes import IRIS_RADIUS, Eyeball
 from synthetic_studio.identity import sample_identity
-from synthetic_studio.landmarks import facemesh_landmarks
+from synthetic_studio.landmarks import IRIS_INDICES, facemesh_landmarks
 from synthetic_studio.template import head_template
 
 SEED = 990_002
@@ -36,7 +33,6 @@ NOSE_DEPTH = "nose-scale-depth-incr"
 NOSE_DEPTH_MEAN, NOSE_DEPTH_SPREAD = 0.0, 0.4
 # Where the four points of an iris's rim lie about its centre, in radii: x to the subject's left, y up.
 RIM = {1: (1.0, 0.0), 2: (0.0, 1.0), 3: (-1.0, 0.0), 4: (0.0, -1.0)}
-IRISES = {"right": 468, "left": 473}
 
 
 def main() -> None:
@@ -82,11 +78,11 @@ def _face(index: int) -> np.ndarray:
     vertices = template.body(identity.phenotypes, controls, identity.actions)[template.kept]
     fine = template.refine(vertices[: template.skin_vertex_count])
     ahead = np.array([0.0, 0.0, 1.0])
-    eyeballs = {side: Eyeball(*template.eyeball(vertices, side), ahead) for side in IRISES}
+    eyeballs = {side: Eyeball(*template.eyeball(vertices, side), ahead) for side in IRIS_INDICES}
     points = facemesh_landmarks(fine, template, eyeballs)
     face = np.full((478, 3), np.nan)
     face[:468] = [points[str(index)] for index in range(468)]
-    for side, first in IRISES.items():
+    for side, first in IRIS_INDICES.items():
         ball = eyeballs[side]
         face[first] = points[str(first)]
         depth = np.sqrt(ball.radius**2 - IRIS_RADIUS**2)

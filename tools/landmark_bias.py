@@ -10,16 +10,14 @@ each camera stands alone in its direction.
 """
 
 import argparse
-import sys
 from dataclasses import dataclass
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.optimize import nnls
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 from bench.alignment_truth import Truth, printed
 from preface.align.keypoints import CANONICAL_KEYPOINTS, FACEMESH478
@@ -38,7 +36,7 @@ from preface.capture.rig import RigCamera
 from preface.geometry import fit_similarity
 
 OUTPUT = Path(__file__).parents[1] / "preface" / "align" / FILE
-NAME = "facemesh-mediapipe-0.10.21"
+NAME = f"facemesh-mediapipe-{version('mediapipe')}"
 FOLDS = 8
 GROSS = 0.25  # eye distances: a detection that is no face at all (profiles) teaches nothing
 ROBUST = 1.5  # medians beyond which an error counts less (Huber), and four of them at most in the variance

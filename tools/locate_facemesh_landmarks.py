@@ -12,13 +12,10 @@ on one head is not.
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 from preface.geometry import Camera, Rigid
 from preface.srgb import encode

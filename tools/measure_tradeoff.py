@@ -10,7 +10,7 @@ PSNR, opacity and depth against the fullest render (128 128 64 samples or twice 
 prepare a head, peak memory above that of the loaded model, and operations of matrix products per ray.
 
 `fit` varies steps, rays per step and resolution of `preface-fit`, one at a time; with `--vary quality`, it measures the
-qualities end to end, each fitted and rendered by its own.
+qualities end to end.
 
 OUTPUT/<render or fit>.json has the figures, and the same command goes on where it was interrupted; .png shows the
 fronts, .md the table. Qualities are chosen from the front by the rules in `tradeoff.front`. Let nothing else run.
@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from preface.artifacts import ArtifactError, write_bytes
+from preface.cli.folders import make_folder
 from preface.cli.output import exit_status, resumable, say, whole_number
 from preface.model.pretrained import prior_flag
 from preface.model.training.prior_files import read_prior
@@ -109,7 +110,7 @@ def _state(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
     Raises:
         ArtifactError: it was of others.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     if not path.exists():
         return {**settings, "points": {}}
     before: dict[str, Any] = json.loads(path.read_bytes())

@@ -9,6 +9,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import metadata, version
 from statistics import fmean
 
 from preface.model.training.prior_files import Prior
@@ -30,17 +31,18 @@ A model of synthetic heads, from which `preface-fit` starts (`--prior pretrained
 code per head, trained on pictures of heads that do not exist. It is here so that one to seven photographs can become a
 head without training anything first, and so that results can be compared. It is not a model of any population."""
 
+# Of anny's licences its package says nothing that a program can read; its repository does.
 _HEADS = """\
 Every head is made by the synthetic studio of this repository (`tools/synthetic_studio`). Nobody was photographed.
 
-- Shapes: anny 0.6.2, a parametric human (code Apache-2.0, data CC0), its phenotypes and face controls drawn at random.
-- Skin, brows, lashes, facial hair, hair and eyes: made by the studio's own code, Apache-2.0. None of the MakeHuman
+- Shapes: anny {anny}, a parametric human (code Apache-2.0, data CC0), its phenotypes and face controls drawn at random.
+- Skin, brows, lashes, facial hair, hair and eyes: made by the studio's own code, {license}. None of the MakeHuman
   materials that the studio can use from a user's disk (`--assets`) were used, since these may not be passed on.
 - Light: one soft studio light. Faces are close to neutral.
 - Cameras, alignment and masks are what `preface-calibrate`, `preface-align` and `preface-build-shards` found in the
   pictures, with their errors; the studio's truth was not used.
 
-The weights, like the code, are under Apache-2.0; see LICENSE."""
+The weights, like the code, are under {license}; see LICENSE."""
 
 _LIMITS = """\
 - Synthetic faces only. Real skin, hair and eyes are finer and more varied than anything it has seen; finetuning adds
@@ -112,15 +114,16 @@ def model_card(facts: Facts) -> str:
     """The card."""
     prior = facts.prior
     width, height = prior.scene.resolution
+    code_license = str(metadata("preface")["License-Expression"])
     parts = [
-        "---\nlicense: apache-2.0\ntags: [nerf, faces, synthetic]\n---",
+        f"---\nlicense: {code_license.lower()}\ntags: [nerf, faces, synthetic]\n---",
         "# The prior that comes with preface",
         _INTRODUCTION,
         f"{len(prior.identities)} heads, {facts.parameters:,} parameters, views of {width}x{height} pixels, within "
         f"a box of {_box(prior)} m about the face. Format: `data_specs/prior.md`. `preface-inspect pretrained` checks "
         "and summarises it.",
         "## What it was trained on",
-        _HEADS,
+        _HEADS.format(anny=version("anny"), license=code_license),
         _dataset(facts),
         "## How it was trained",
         _training(facts),
@@ -161,19 +164,17 @@ def _dataset(facts: Facts) -> str:
 
 def _training(facts: Facts) -> str:
     prior, trained = facts.prior, facts.prior.configuration["model"]["matmul"]
+    rows = [(s.name, _time(s.seconds), f"`{shlex.join(shlex.split(s.command))}`") for s in facts.stages]
     where = f", on {facts.machine}" if facts.machine else ""
     lines = [
         f"Preset `{prior.configuration.get('preset')}`, seed {prior.provenance['seed']}, {prior.steps:,} steps{where}. "
         f"`model.json` has every setting and the versions of all packages. Its products were {trained}; released, it "
         f"multiplies in {prior.model.matmul}. From nothing:",
-        "| stage | time | command |\n|---|---|---|\n"
-        + "\n".join(f"| {s.name} | {_time(s.seconds)} | `{shlex.join(_words(s))}` |" for s in facts.stages),
+        "\n".join(
+            ["| stage | time | command |", "|---|---|---|", *(f"| {' | '.join(row)} |" for row in rows)]
+        ),
     ]
     return "\n\n".join(lines)
-
-
-def _words(stage: Stage) -> list[str]:
-    return shlex.split(stage.command)
 
 
 def _time(seconds: float) -> str:

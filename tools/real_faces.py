@@ -29,33 +29,49 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from preface.artifacts import ArtifactError, load_json, provenance, write_bytes
+from preface.artifacts import load_json, provenance, write_bytes
 from preface.capture.rig import read_rig
+from preface.cli.folders import make_folder, require_writable
+from preface.cli.output import exit_status, resumable
+from preface.cli.typed_flags import refusing, told_in_a_line
 from preface.geometry import Rigid, Similarity, fit_similarity
-from preface.model.fitting.configuration import defaults
+from preface.model.fitting.configuration import Quality, defaults
 from preface.model.pretrained import flag_word
 from preface.shards import Dataset
 from preface.shards.building import build_manifest
 from preface.shards.heads import head_of
 from preface.shards.writer import ShardWriter
 
+PROGRAM = "real_faces"
 PERSON = "person"
 FIGURES = ("psnr", "ssim", "lpips", "psnr_face", "ssim_face", "lpips_face")
 
 
+class CommandError(RuntimeError):
+    """A command that has failed, and has said why."""
+
+
 @dataclass(frozen=True)
 class RealFaces:
-    """Fit heads to real photographs and measure them on others."""
+    """Fit heads to real photographs and measure them on others.
+
+    FOLDER of a walk-around: images/NAME.jpg (or another format) of one person by one moving camera, a COLMAP model of
+    them in sparse/0/, and perhaps masks, which only measure ours, in matte/.
+
+    FOLDER of a studio: calibration/CAMERA/ with frames of a chessboard, and subjects/IDENTITY/CAMERA.jpg.
+
+    What is finished is not done again. OUTPUT/table.md and table.json have the figures.
+    """
 
     layout: tyro.conf.Positional[Literal["walk-around", "studio"]]
-    """How FOLDER is laid out."""
+    """How FOLDER is laid out, see above."""
     folder: tyro.conf.Positional[Path]
     """The photographs."""
     output: Path
     """Where everything is written."""
     prior: Literal["pretrained"] | Path = "pretrained"
     """Folder of the prior, with template.json; `pretrained` is the one that comes with preface."""
-    quality: Literal["draft", "balanced", "reference"] = "draft"
+    quality: Quality = "draft"
     """Of the fits."""
     resolution: str = "144x216"
     """WIDTHxHEIGHT of the views, cut out around the head."""
@@ -82,21 +98,21 @@ class Row:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run all stages; 0 when the table is written, 1 when a command failed or something is missing."""
-    config = tyro.cli(RealFaces, prog="real_faces", args=arguments)
-    try:
-        config.output.mkdir(parents=True, exist_ok=True)
-        rows = _walk_around(config) if config.layout == "walk-around" else _studio(config)
-        table = [_figures(row) for row in rows]
-        write_bytes(config.output / "table.json", (json.dumps(table, indent=1) + "\n").encode())
-        write_bytes(config.output / "table.md", _markdown(table).encode())
-    except subprocess.CalledProcessError as error:
-        print(f"real_faces: {error.cmd[0]} ended with {error.returncode}", file=sys.stderr)
-        return 1
-    except (ArtifactError, OSError) as error:
-        print(f"real_faces: {error}", file=sys.stderr)
-        return 1
-    print(config.output / "table.md")
-    return 0
+    with told_in_a_line(PROGRAM):
+        config = tyro.cli(RealFaces, prog=PROGRAM, args=arguments)
+    reasons = (CommandError, OSError)
+    return resumable(
+        lambda: exit_status(lambda: [str(_table(config))], refusing(PROGRAM), config.folder, lambda: reasons)
+    )
+
+
+def _table(config: RealFaces) -> Path:
+    """Run what is not done yet, and write the table."""
+    require_writable(make_folder(config.output))
+    rows = _walk_around(config) if config.layout == "walk-around" else _studio(config)
+    table = [_figures(row) for row in rows]
+    write_bytes(config.output / "table.json", (json.dumps(table, indent=1) + "\n").encode())
+    return write_bytes(config.output / "table.md", _markdown(table).encode())
 
 
 # ------------------------------------------------------------------------------------- walk-around
@@ -140,7 +156,7 @@ def _from_pictures(config: RealFaces, shards: Path, pictures: Mapping[str, Path]
 
 
 def _copy(files: Mapping[str, Path], folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     for name, file in files.items():
         shutil.copy(file, folder / f"{name}{file.suffix}")
 
@@ -175,7 +191,7 @@ def _between(shipped: np.ndarray, found: np.ndarray) -> Similarity:
 
 def _moved(dataset: Dataset, motion: Similarity, folder: Path) -> Path:
     """The first identity's views with cameras that were moved, as shards."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     size = dataset.manifest.width, dataset.manifest.height
     head = head_of(dataset, 0, range(dataset.manifest.views))
     poses = [motion.apply_to_pose(Rigid(m[:, :3], m[:, 3])) for m in head.views.world_from_camera]
@@ -260,10 +276,16 @@ def _measured(head: Path, shards: Path, views: Sequence[str]) -> Path:
 
 
 def _run(command: str, *arguments: object) -> None:
-    """Print a command and run it."""
+    """Print a command and run it.
+
+    Raises:
+        CommandError: it did not end with 0.
+    """
     words = [command, *map(flag_word, arguments)]
     print(f"\n$ {shlex.join(words)}", flush=True)
-    subprocess.run([str(Path(sys.executable).with_name(command)), *words[1:]], check=True)
+    ended = subprocess.run([str(Path(sys.executable).with_name(command)), *words[1:]], check=False)
+    if ended.returncode:
+        raise CommandError(f"{command} ended with {ended.returncode}")
 
 
 # ------------------------------------------------------------------------------------------- table

@@ -28,6 +28,9 @@ import tyro
 
 from model_card import Facts, Result, model_card
 from preface.artifacts import ArtifactError, json_text, load_json, sha256, validate, write_bytes
+from preface.cli.folders import make_folder
+from preface.cli.output import exit_status, interruptible
+from preface.cli.typed_flags import refusing, told_in_a_line
 from preface.model.evaluation.metrics_file import read_metrics
 from preface.model.pretrained import CARD_FILE, FILES, FOLDER
 from preface.model.training.checkpoint import WEIGHTS, write_checkpoint
@@ -36,6 +39,7 @@ from preface.model.training.prior_files import Prior, prior_payload, read_prior
 from preface.shards.manifest import Manifest, read_manifest
 from show_demo import Stage, read_stages
 
+PROGRAM = "release_prior"
 MAX_BYTES = 8_000_000  # of all files; a package is not the place for more
 OWN_MATERIALS = "--assets"  # of the studio: whatever is under it may not be passed on
 
@@ -62,13 +66,9 @@ class ReleasePrior:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the tool: 0 when the files are written, 1 when something is wrong."""
-    config = tyro.cli(ReleasePrior, prog="release_prior", args=arguments)
-    try:
-        print(release(config))
-    except ArtifactError as error:
-        print(f"release_prior: {error}", file=sys.stderr)
-        return 1
-    return 0
+    with told_in_a_line(PROGRAM):
+        config = tyro.cli(ReleasePrior, prog=PROGRAM, args=arguments)
+    return interruptible(lambda: exit_status(lambda: [str(release(config))], refusing(PROGRAM), config.prior))
 
 
 def release(config: ReleasePrior) -> Path:
@@ -211,10 +211,7 @@ def _require_small(prior: Path, data: Mapping[str, bytes]) -> None:
 
 def _placed(data: Mapping[str, bytes], output: Path) -> Path:
     """Put files in place, what readers look for last."""
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ArtifactError.from_os(output, "writing", error) from error
+    make_folder(output)
     for name in FILES:
         write_bytes(output / name, data[name])
     return output / CARD_FILE

@@ -16,12 +16,15 @@ import tyro
 
 from preface.artifacts import ArtifactError, load_json, provenance, sha256
 from preface.capture.images import read_image
+from preface.cli.output import exit_status
+from preface.cli.typed_flags import refusing, told_in_a_line
 from preface.model.pretrained import pretrained_folder
 from preface.model.training.prior_files import MODEL_FILE, read_prior
 from preface.reports import KeyFigure, Link, Report, Section, contact_sheet
 from preface.reports.pictures import Picture, as_picture
 from preface.shards import Dataset
 
+PROGRAM = "show_demo"
 HEAD, BASELINE = "head", "head-without-prior"  # folders of the two fits, and their names in the evaluation
 STAGES_FILE = "stages.tsv"
 INPUT_HEIGHT = 288
@@ -55,14 +58,13 @@ class Stage:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; 0 when the page is written, 1 when something is missing."""
-    config = tyro.cli(ShowDemo, prog="show_demo", args=arguments)
-    try:
-        page = build_report(config.folder).write(config.folder / "report.html")
-    except ArtifactError as error:
-        print(f"show_demo: {error}", file=sys.stderr)
-        return 1
-    print(page)
-    return 0
+    with told_in_a_line(PROGRAM):
+        config = tyro.cli(ShowDemo, prog=PROGRAM, args=arguments)
+
+    def run() -> list[str]:
+        return [str(build_report(config.folder).write(config.folder / "report.html"))]
+
+    return exit_status(run, refusing(PROGRAM), config.folder)
 
 
 def build_report(folder: Path) -> Report:

@@ -19,6 +19,8 @@ from preface.artifacts import ArtifactError, load_json, provenance
 from preface.capture.images import read_exr, read_image
 from preface.capture.manifest import Capture, Subject, read_capture
 from preface.capture.rig import Rig, RigCamera, read_rig
+from preface.cli.output import exit_status
+from preface.cli.typed_flags import refusing, told_in_a_line
 from preface.reports import (
     KeyFigure,
     Report,
@@ -31,6 +33,7 @@ from preface.reports import (
 )
 from preface.reports.pictures import GREEN, Picture, as_picture
 
+PROGRAM = "show_studio"
 SHEET_TILE = (192, 288)
 CLOSE_TILE = (360, 540)
 CLOSE_CAMERAS = 4  # rows of the close look; the studio numbers its most useful views first
@@ -101,15 +104,14 @@ class Studio:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; 0 when the page is written, 1 when something is wrong with the studio."""
-    config = tyro.cli(ShowStudio, args=arguments)
-    try:
+    with told_in_a_line(PROGRAM):
+        config = tyro.cli(ShowStudio, prog=PROGRAM, args=arguments)
+
+    def run() -> list[str]:
         studio = Studio(config.studio, read_capture(config.studio / "capture"))
-        page = build_report(studio, config).write(config.studio / config.page)
-    except ArtifactError as error:
-        print(f"show_studio: {error}", file=sys.stderr)
-        return 1
-    print(page)
-    return 0
+        return [str(build_report(studio, config).write(config.studio / config.page))]
+
+    return exit_status(run, refusing(PROGRAM), config.studio)
 
 
 def build_report(studio: Studio, config: ShowStudio) -> Report:

@@ -18,6 +18,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from preface.cli.folders import make_folder
 from preface.cli.output import exit_status
 from speed_table import keeping, readme
 from speed_table.stages import SCRIPTS
@@ -47,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _keep(options: argparse.Namespace) -> list[str]:
-    options.measured.mkdir(parents=True, exist_ok=True)
+    make_folder(options.measured)
     path = keeping.keep(options.source, options.name, options.of, options.given, options.measured)
     return [str(path)]
 

@@ -57,7 +57,7 @@ def photograph_sheet(views: Sequence[View], load_image: LoadImage) -> Picture:
 def _tile(studio: AlignedStudio, view: View, load_image: LoadImage) -> tuple[Picture | None, str]:
     identity, camera = view
     found, image = studio.landmarks[view], load_image(identity, camera)
-    caption = f"{identity} {camera} {_verdict(studio, identity, camera)}"
+    caption = f"{identity} {camera}\n{_verdict(studio, identity, camera)}"
     if image is None or isinstance(found, NoFace):
         return None, caption
     good = _inliers(studio, identity, camera, len(found.pixels))

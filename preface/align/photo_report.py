@@ -72,7 +72,7 @@ def _trust(report: Report, found: PhotoAlignment) -> None:
                 "value": statement.value,
                 "±": statement.deviation,
                 "unit": statement.unit,
-                "rests on": statement.source,
+                "rests on": statement.rests_on,
             }
             for statement in found.trust
         ],

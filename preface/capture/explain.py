@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from preface.capture.boards import board_in_words, marker_corners, marker_dictionary, with_squares
-from preface.capture.finding import Picture, fitting_markers
+from preface.capture.finding import MARKER_PIXELS, Picture, fitting_markers
 from preface.capture.manifest import DICTIONARY_SIZES, Board
 
 EXPLAIN_SIDE = 1280  # pixels; for an explanation, large markers will do
@@ -36,8 +36,15 @@ def explain(board: Board, images: Sequence[np.ndarray]) -> str:
     return (
         _other_markers(board, shown)
         or _other_chessboard(board, shown)
-        or f"nothing like a board is seen (expected a {board_in_words(board)})"
+        or f"nothing like a board is seen (expected a {board_in_words(board)}){_too_small(board)}"
     )
+
+
+def _too_small(board: Board) -> str:
+    """What else it may be: how many pixels a marker of a board has that is not found, nobody knows."""
+    if board.type == "chessboard":
+        return ""
+    return f", or the images are too small: a marker needs some {MARKER_PIXELS} pixels along its side"
 
 
 def _small(shown: np.ndarray) -> np.ndarray:

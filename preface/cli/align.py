@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from preface.cli.output import exit_status, resumable, whole_number
+from preface.cli.usage import Parser
 from preface.model.pretrained import prior_flag, prior_path
 
 _DESCRIPTION = "Find the face in every view and bring all faces into one canonical frame."
@@ -57,7 +58,7 @@ def _template_path(given: str | Path | None) -> Path | None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("preface-align", description=_DESCRIPTION, epilog=_EPILOG)
+    parser = Parser("preface-align", description=_DESCRIPTION, epilog=_EPILOG)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_studio(commands)
     _add_photos(commands)

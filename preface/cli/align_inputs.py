@@ -4,10 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from preface.artifacts import ArtifactError, load_json
+from preface.align.alignment_files import TEMPLATE_FILE
+from preface.artifacts import ArtifactError
 from preface.capture.images import read_header
 from preface.capture.manifest import FILE_NAME, Capture, Subject
-from preface.capture.rig import SCHEMA, Rig, read_rig
+from preface.capture.rig import Rig, read_rig
+from preface.cli.rig_files import rig_files
 from preface.plain_words import suggestion
 
 View = tuple[str, str]  # identity, camera
@@ -35,7 +37,7 @@ def rigs_of_takes(paths: Sequence[Path], takes: Sequence[str]) -> tuple[dict[str
         ArtifactError: a path without a rig, two rigs of one take, or a take without a rig.
     """
     found: dict[str, TakeRig] = {}
-    for path in (file for named in paths for file in _rig_files(named)):
+    for path in (file for named in paths for file in rig_files(named)):
         rig = read_rig(path)
         if rig.take in found and found[rig.take].path.resolve() != path.resolve():
             problem = f"is a second rig of take '{rig.take}', beside {found[rig.take].path}"
@@ -52,18 +54,6 @@ def rigs_of_takes(paths: Sequence[Path], takes: Sequence[str]) -> tuple[dict[str
             remedy = "Calibrate that take and name its rig too, or correct 'take' in the rig"
             raise ArtifactError(paths[0], "take", problem, remedy)
     return {take: found[take] for take in takes}, []
-
-
-def _rig_files(path: Path) -> list[Path]:
-    """The rigs at a path: a file, or those in a folder, in its folder `rigs`, or in its takes' folders."""
-    if not path.is_dir():
-        return [path]
-    candidates = [*path.glob("*.json"), *path.glob("rigs/*.json"), *path.glob("*/rig.json")]
-    found = sorted(file for file in candidates if load_json(file).get("schema") == SCHEMA)
-    if not found:
-        problem = "holds no rig, neither as *.json nor as rigs/*.json nor as */rig.json"
-        raise ArtifactError(path, "folder", problem, "Name the rig, as preface-calibrate wrote it")
-    return found
 
 
 def chosen_subjects(capture: Capture, only: Sequence[str] | None) -> list[Subject]:
@@ -83,6 +73,11 @@ def chosen_subjects(capture: Capture, only: Sequence[str] | None) -> list[Subjec
         if name not in known:
             raise ArtifactError(manifest, "subjects", f"there is no '{name}'", suggestion(name, known))
     return [subject for subject in subjects if not only or subject.id in only]
+
+
+def template_file(path: Path) -> Path:
+    """The template that a path means: the file, or that of an alignment's or a prior's folder."""
+    return path / TEMPLATE_FILE if path.is_dir() else path
 
 
 def usable_photographs(

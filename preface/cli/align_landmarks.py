@@ -14,9 +14,10 @@ from preface.align.keypoints import FACEMESH478
 from preface.align.landmark_bias import LandmarkBias, shipped_bias
 from preface.align.landmark_files import landmark_file, read_landmark_folder, read_landmarks, write_landmarks
 from preface.align.landmarks import NoFace, ViewLandmarks
-from preface.artifacts import ArtifactError, load_json, provenance, sha256
+from preface.artifacts import load_json, provenance, sha256
 from preface.capture.images import ImageHeader, read_header, read_image
 from preface.capture.upright import read_upright, read_upright_header
+from preface.cli.folders import make_folder
 from preface.cli.output import say
 from preface.cli.usage import UsageError
 
@@ -162,14 +163,6 @@ def described(options: DetectionOptions) -> dict[str, Any]:
     }
     settings["rotations"] = list(options.rotations)
     return settings | {"landmark_model": options.landmark_model.name if options.landmark_model else None}
-
-
-def make_folder(path: Path) -> None:
-    """Create a folder and those above it; an ArtifactError says what hinders."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ArtifactError.from_os(error.filename or path, "writing", error) from error
 
 
 def _history(options: DetectionOptions, photograph: Path) -> dict[str, Any]:

@@ -37,12 +37,15 @@ from preface.capture.photos.files import Photograph, find_photographs
 from preface.capture.rig import read_rig, write_rig
 from preface.capture.upright import read_upright, read_upright_header
 from preface.cli.align_folder import forget
-from preface.cli.align_landmarks import UPRIGHT, Landmarks, landmarks_of, make_folder
-from preface.cli.output import say
+from preface.cli.align_inputs import template_file
+from preface.cli.align_landmarks import UPRIGHT, Landmarks, landmarks_of
+from preface.cli.folders import make_folder, require_writable
+from preface.cli.output import known_distance, say
+from preface.cli.rig_files import RIG_FILE, one_rig_file
 from preface.cli.usage import UsageError
 from preface.plain_words import suggestion
 
-RIG_FILE, REPORT_FILE = "rig.json", "report.html"
+REPORT_FILE = "report.html"
 SCHEME = "facemesh478"
 
 
@@ -50,14 +53,14 @@ def run(config: argparse.Namespace) -> list[str]:
     """Find landmarks, cameras and face, write the report, the rig and then the alignment."""
     identity = _identity(config)
     photographs = _photographs(config)
-    cameras = read_rig(config.cameras) if config.cameras else None
+    cameras = read_rig(one_rig_file(config.cameras)) if config.cameras else None
     given = read_template(config.template) if config.template else None
     if given is not None:
         require_same_scheme(given, [SCHEME])
     if config.metric_cameras and cameras is None:
         raise UsageError("--metric-cameras speaks of the cameras that --cameras gives, and there are none")
-    known = _known_distance(config)
-    make_folder(config.output)
+    known = known_distance(config.known_distance)
+    require_writable(config.output)
     files = {(identity, photo.id): photo.path for photo in photographs}
     landmarks = landmarks_of(config, files, UPRIGHT)
     views = [
@@ -129,7 +132,7 @@ def _photographs(config: argparse.Namespace) -> list[Photograph]:
         raise ArtifactError(
             config.source, "photographs", problem, "Give one to seven photographs of one person"
         )
-    return [_single(files[0])] if len(files) == 1 else find_photographs(files, "one", read_upright_header)
+    return [_single(files[0])] if len(files) == 1 else find_photographs(files, None, read_upright_header)
 
 
 def _single(file: Path) -> Photograph:
@@ -142,16 +145,6 @@ def _single(file: Path) -> Photograph:
     name = re.sub(r"[^A-Za-z0-9._-]", "_", file.stem)[:90]
     name = name if name[0].isalnum() else f"photo{name}"
     return Photograph(name, file, header.width, header.height, 0, focal)
-
-
-def _known_distance(config: argparse.Namespace) -> tuple[str, str, float] | None:
-    if config.known_distance is None:
-        return None
-    first, second, metres = config.known_distance
-    try:
-        return first, second, float(metres)
-    except ValueError as error:
-        raise UsageError(f"--known-distance: '{metres}' is not a length in metres") from error
 
 
 # ----------------------------------------------------------------------------------------- results
@@ -209,13 +202,12 @@ def _history(config: argparse.Namespace, landmarks: Landmarks) -> dict[str, Any]
         "metric_cameras": config.metric_cameras,
         **landmarks.config,
     }
-    named = {"given cameras": config.cameras, "given template": config.template}
-    inputs = {name: file for name, file in named.items() if file is not None}
-    files = {
-        name: file / (RIG_FILE if name == "given cameras" else TEMPLATE_FILE) if file.is_dir() else file
-        for name, file in inputs.items()
-    }
-    history = provenance(settings, files)
+    inputs = {}
+    if config.cameras is not None:
+        inputs["given cameras"] = one_rig_file(config.cameras)
+    if config.template is not None:
+        inputs["given template"] = template_file(config.template)
+    history = provenance(settings, inputs)
     for of_view in landmarks.inputs.values():
         history["inputs"] |= of_view
     return history
@@ -238,7 +230,7 @@ def _write(
         except ArtifactError:  # the photograph's reason says so
             return None
 
-    folder, template = config.output, studio.template
+    folder, template = make_folder(config.output), studio.template
     assert template is not None
     report = photo_report(identity, found, studio, history, load_image).write(folder / REPORT_FILE)
     forget(folder)

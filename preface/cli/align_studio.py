@@ -32,8 +32,15 @@ from preface.capture.images import displayable, read_image
 from preface.capture.manifest import FILE_NAME, Capture, Subject, read_capture
 from preface.capture.rig import Rig
 from preface.cli.align_folder import forget
-from preface.cli.align_inputs import TakeRig, chosen_subjects, rigs_of_takes, usable_photographs
-from preface.cli.align_landmarks import Landmarks, landmarks_of, make_folder
+from preface.cli.align_inputs import (
+    TakeRig,
+    chosen_subjects,
+    rigs_of_takes,
+    template_file,
+    usable_photographs,
+)
+from preface.cli.align_landmarks import Landmarks, landmarks_of
+from preface.cli.folders import make_folder, require_writable
 from preface.cli.output import say
 from preface.cli.usage import UsageError
 
@@ -52,7 +59,7 @@ def run(config: argparse.Namespace) -> list[str]:
     given = read_template(config.template) if config.template else None
     photographs, unusable = usable_photographs(capture, subjects, rigs)
     _require_metric(rigs, config)
-    make_folder(config.output)
+    require_writable(config.output)
     landmarks = landmarks_of(config, photographs)
     found = {
         (subject.id, camera.id): landmarks.found[subject.id, camera.id]
@@ -195,8 +202,7 @@ def _history(
     if not capture.inferred:
         inputs[FILE_NAME] = capture.directory / FILE_NAME
     if config.template is not None:
-        file = config.template / TEMPLATE_FILE if config.template.is_dir() else config.template
-        inputs["given template"] = file
+        inputs["given template"] = template_file(config.template)
     return provenance(settings, inputs)
 
 
@@ -217,7 +223,7 @@ def _write(
         except ArtifactError:  # the view's reason says so
             return None
 
-    folder = config.output
+    folder = make_folder(config.output)
     report = alignment_report(studio, history, load_image).write(folder / REPORT_FILE)
     if studio.template is None or not studio.placements:
         problem = f"not one of {len(subjects)} people can be aligned"

@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 
-from preface.cli.output import exit_status, resumable, size, whole_number
+from preface.cli.output import exit_status, number, positive, resumable, size, whole_number
+from preface.cli.usage import Parser
 
 _DESCRIPTION = "Build a dataset of shards from a capture, its rigs and its alignment."
 _EPILOG = (
@@ -22,6 +23,7 @@ _OTHERS = {
     "export": ("preface.cli.build_shards_export", "Write shards, or a part of them, for other trainers."),
     "import": ("preface.cli.build_shards_import", "Turn a public dataset into a capture with rigs."),
 }
+MAX_BOX = 100.0  # metres from the face; more is another unit
 METHODS = ("auto", "given", "green", "black", "plate", "selfie", "onnx", "none")
 
 
@@ -30,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     parser, run = _chosen(words)
     config = parser.parse_args(words)
-    return resumable(lambda: exit_status(lambda: run(config), parser, parser.prog, _reasons))
+    return resumable(lambda: exit_status(lambda: run(config), parser, config.source, _reasons))
 
 
 def _reasons() -> tuple[type[Exception], ...]:
@@ -48,7 +50,7 @@ def _chosen(words: list[str]) -> tuple[argparse.ArgumentParser, Callable[[argpar
     name = words.pop(0)
     module, description = _OTHERS[name]
     found = import_module(module)
-    parser = argparse.ArgumentParser(f"preface-build-shards {name}", description=description)
+    parser = Parser(f"preface-build-shards {name}", description=description)
     found.add_arguments(parser)
     return parser, found.run
 
@@ -62,18 +64,8 @@ def _build(config: argparse.Namespace) -> list[str]:
 # --------------------------------------------------------------------------------------- the flags
 
 
-def _positive(text: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = 0.0
-    if not 0 < number < float("inf"):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
-    return number
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("preface-build-shards", description=_DESCRIPTION, epilog=_EPILOG)
+    parser = Parser("preface-build-shards", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument(
         "source",
         metavar="CAPTURE",
@@ -140,7 +132,7 @@ def _add_images(parser: argparse.ArgumentParser) -> None:
     )
     images.add_argument(
         "--white",
-        type=_positive,
+        type=positive,
         default=1.0,
         metavar="LIGHT",
         help="linear light of EXR images that becomes white (default: 1)",
@@ -155,7 +147,7 @@ def _add_images(parser: argparse.ArgumentParser) -> None:
     images.add_argument(
         "--box",
         nargs=6,
-        type=float,
+        type=number(-MAX_BOX, MAX_BOX),
         metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="the box that holds a head, canonical frame, metres (default: -0.20 -0.25 -0.25 0.20 0.25 0.12)",
     )

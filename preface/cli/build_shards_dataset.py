@@ -11,12 +11,15 @@ from tqdm import tqdm
 from preface.align.alignment_files import read_index
 from preface.artifacts import ArtifactError
 from preface.cli.align_inputs import rigs_of_takes
+from preface.cli.folders import make_folder, require_own, require_writable
 from preface.cli.output import say
 from preface.cli.usage import UsageError
+from preface.plain_words import counted, disk_space
 from preface.shards.dataset.configuration import HEAD_BOX, BuildConfiguration
 from preface.shards.dataset.finishing import Built, build_all, finish
 from preface.shards.dataset.people import LeftOut, People, find_people, is_capture
 from preface.shards.dataset.plan import (
+    HOLDOUT,
     ShardTask,
     check_framing,
     default_jobs,
@@ -38,6 +41,8 @@ Runner = Callable[[Sequence[ShardTask]], Iterator[TaskResult]]
 def run(config: argparse.Namespace) -> list[str]:
     """Build, or say what building would take; returns the lines to print."""
     _check_usage(config)
+    if not config.dry_run:
+        require_writable(config.output)
     people, tasks = _plan(config)
     if config.dry_run:
         return _dry_run(config, people, tasks)
@@ -45,7 +50,7 @@ def run(config: argparse.Namespace) -> list[str]:
         return _one(config, tasks)
     if config.finish:
         _require_all(tasks)
-    make_folder(config.output)
+    make_dataset_folder(config.output)
     use_one_thread()
     named = _Named()
     with tqdm(
@@ -119,8 +124,28 @@ def _plan(config: argparse.Namespace) -> tuple[People, list[ShardTask]]:
     if config.strict and people.left_out:
         raise strict_error(config.source, people.left_out[0])
     names = [person.identity for person in people.people]
-    splits(names, config.holdout, config.seed, config.source, people.persons)  # or say so now
+    _check_holdout(config.holdout, names)
+    held_out = splits(names, config.holdout, config.seed, config.source, people.persons)[HOLDOUT]
+    if config.holdout and not held_out:
+        raise UsageError(
+            f"--holdout: '{config.holdout[0]}' of {len(names)} identities is nobody: hold out more, or leave it out"
+        )
     return people, tasks
+
+
+def _check_holdout(holdout: Sequence[str], names: Sequence[str]) -> None:
+    """Refuse what reads as a number and is no part of a whole; whether it can be so many, or these, `splits` says."""
+    if len(holdout) != 1 or holdout[0] in names or holdout[0].isdecimal():
+        return
+    text = holdout[0]
+    try:
+        share = float(text[:-1]) / 100 if text.endswith("%") else float(text)
+    except ValueError:
+        return  # a name
+    if not 0 < share < 1:
+        raise UsageError(
+            f"--holdout: '{text}' is neither a number of identities, a share between 0 and 1 (0.1 or 10%), nor a name"
+        )
 
 
 def _configuration(config: argparse.Namespace, views: int) -> BuildConfiguration:
@@ -146,10 +171,12 @@ def _dry_run(config: argparse.Namespace, people: People, tasks: list[ShardTask])
     found = estimate(tasks, config.jobs or default_jobs())
     enough = "" if found.dataset_bytes < found.free_bytes else ", which is NOT enough"
     return [
-        f"{found.people} identities, {found.views} views, {len(people.left_out)} people or views left out",
-        f"{found.shards} shards (0 to {found.shards - 1}) of {found.dataset_bytes / 1e9:.3g} GB in all; "
-        f"{found.free_bytes / 1e9:.3g} GB are free at {config.output}{enough}",
-        f"about {_duration(found.seconds)} in {config.jobs or default_jobs()} processes, by the time of one view",
+        f"{counted(found.people, 'identity', 'identities')}, {counted(found.views, 'view', 'views')}, "
+        f"{len(people.left_out)} people or views left out",
+        f"{counted(found.shards, 'shard', 'shards')} (0 to {found.shards - 1}) of {disk_space(found.dataset_bytes)} in "
+        f"all; {disk_space(found.free_bytes)} are free at {config.output}{enough}",
+        f"about {_duration(found.seconds)} in {counted(config.jobs or default_jobs(), 'process', 'processes')}, by the "
+        "time of one view",
         "nothing was written",
     ]
 
@@ -175,7 +202,7 @@ def _one(config: argparse.Namespace, tasks: list[ShardTask]) -> list[str]:
     if config.shard >= len(tasks):
         problem = f"there is no shard {config.shard}, only 0 to {len(tasks) - 1}"
         raise ArtifactError(config.output, "shard", problem, "Correct --shard")
-    make_folder(config.output)
+    make_dataset_folder(config.output)
     use_one_thread()
     result = run_task(tasks[config.shard])
     for entry in result.left_out:
@@ -199,21 +226,14 @@ def _require_all(tasks: list[ShardTask]) -> None:
         raise ArtifactError(tasks[0].folder, "shards", problem, remedy)
 
 
-def make_folder(folder: Path) -> None:
-    """Make the folder of a dataset.
+def make_dataset_folder(folder: Path) -> None:
+    """Make the folder of a dataset, unless it is there.
 
     Raises:
         ArtifactError: it cannot be made, or it holds other things than a dataset.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        names = {path.name for path in folder.iterdir()}
-    except OSError as error:
-        raise ArtifactError.from_os(folder, "writing", error) from error
-    ours = [name for name in names if name == MANIFEST_FILE or name.lstrip(".").startswith("shard-")]
-    if names and not ours:
-        problem = f"holds other things than a dataset ({', '.join(sorted(names)[:3])})"
-        raise ArtifactError(folder, "folder", problem, "Choose a new folder, or empty this one")
+    make_folder(folder)
+    require_own(folder, "a dataset", (MANIFEST_FILE, "shard-*", ".shard-*"))
 
 
 def _summary(built: Built, people: People) -> list[str]:
@@ -221,7 +241,8 @@ def _summary(built: Built, people: People) -> list[str]:
     kept = sum(result.state == "kept" for result in built.results)
     left_out: list[LeftOut] = [*people.left_out, *built.left_out]
     return [
-        f"{identities} identities in {len(built.results)} shards, {kept} of them finished before and kept",
+        f"{counted(identities, 'identity', 'identities')} in {counted(len(built.results), 'shard', 'shards')}, {kept} "
+        "of them finished before and kept",
         f"{len(left_out)} people or views left out" + ("; the data card says why" if left_out else ""),
     ]
 

@@ -4,10 +4,9 @@ The heavy imports wait until there is something to do, so that ``--help`` does n
 """
 
 import argparse
-import math
 from pathlib import Path
 
-from preface.cli.output import say
+from preface.cli.output import positive, say
 from preface.cli.usage import UsageError
 
 LAYOUTS = ("cafca", "facescape")
@@ -38,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--metres-per-unit",
-        type=_positive,
+        type=positive,
         metavar="METRES",
         help="length of the dataset's unit (default: 1)",
     )
@@ -53,16 +52,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="stop at the first view that must be left out, and write nothing",
     )
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
-    return value
 
 
 def run(config: argparse.Namespace) -> list[str]:

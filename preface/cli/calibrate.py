@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from preface.cli.output import exit_status, whole_number
+from preface.cli.output import exit_status, interruptible, length, whole_number
+from preface.cli.usage import Parser
 
 _DESCRIPTION = "Calibrate the cameras of a capture, or bring in the calibration of another program."
 _EPILOG = "Exit status: 0 when the rig was written, 1 when something is wrong, 2 for wrong usage."
@@ -35,7 +36,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _keep_blas_to_one_thread()
     parser = _parser()
     config = parser.parse_args(arguments)
-    return exit_status(lambda: config.run(config), config.parser, config.source, _reasons)
+    return interruptible(
+        lambda: exit_status(lambda: config.run(config), config.parser, config.source, _reasons)
+    )
 
 
 def _keep_blas_to_one_thread() -> None:
@@ -78,13 +81,17 @@ def _run_import(config: argparse.Namespace) -> list[str]:
     from preface.artifacts import provenance
     from preface.capture.formats import read_rig_from
     from preface.capture.rig import write_rig
+    from preface.cli.folders import make_folder
+    from preface.cli.rig_files import new_rig_file
 
     rig = read_rig_from(config.source, config.format)
     source = config.source
     files = [source] if source.is_file() else sorted(f for f in source.iterdir() if f.is_file())
     history = provenance({"command": "import", "format": config.format}, {file.name: file for file in files})
     named = replace(rig, take=config.take or rig.take, scale=config.scale, provenance=history)
-    written = write_rig(config.output, named)
+    path = new_rig_file(config.output)
+    make_folder(path.parent)
+    written = write_rig(path, named)
     assumed = [f"assumed: {words}" for words in rig.metadata["imported"]["assumptions"]]
     return [
         f"{len(rig.cameras)} cameras of format {rig.metadata['imported']['format']}",
@@ -96,15 +103,17 @@ def _run_import(config: argparse.Namespace) -> list[str]:
 def _run_export(config: argparse.Namespace) -> list[str]:
     from preface.capture.formats import export_rig
     from preface.capture.rig import read_rig
+    from preface.cli.rig_files import one_rig_file
 
-    return [str(export_rig(read_rig(config.source), config.output, config.format))]
+    rig = read_rig(one_rig_file(config.source))
+    return [str(export_rig(rig, config.output, config.format))]
 
 
 # --------------------------------------------------------------------------------------- the flags
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("preface-calibrate", description=_DESCRIPTION, epilog=_EPILOG)
+    parser = Parser("preface-calibrate", description=_DESCRIPTION, epilog=_EPILOG)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_board(commands)
     _add_photos(commands)
@@ -127,6 +136,14 @@ def _add_board(commands: Any) -> None:
     parser = _command(
         commands, "board", _run_board, words, "CAPTURE: folder of the capture, or its capture.json"
     )
+    _add_the_board(parser)
+    _add_the_model(parser)
+    _add_what_is_used(parser)
+    _add_output(parser, "for several takes a folder, which then holds rigs/TAKE.json")
+    parser.set_defaults(output=None)  # what it is depends on the number of takes
+
+
+def _add_the_board(parser: argparse.ArgumentParser) -> None:
     board = parser.add_argument_group("the board (default: as the manifest says)")
     board.add_argument("--board", choices=("charuco", "chessboard", "aprilgrid"), help="what it is")
     board.add_argument(
@@ -136,14 +153,17 @@ def _add_board(commands: Any) -> None:
     )
     board.add_argument(
         "--square-size",
-        type=_length,
+        type=length,
         metavar="METRES",
         help="edge of a square, measured; tag to tag in an aprilgrid",
     )
-    board.add_argument("--marker-size", type=_length, metavar="METRES", help="edge of a marker")
+    board.add_argument("--marker-size", type=length, metavar="METRES", help="edge of a marker")
     board.add_argument("--dictionary", metavar="NAME", help="OpenCV's name, such as DICT_4X4_50")
     board.add_argument("--legacy", action="store_true", help="a ChArUco board made with OpenCV before 4.6")
     board.add_argument("--inverted", action="store_true", help="printed white on black")
+
+
+def _add_the_model(parser: argparse.ArgumentParser) -> None:
     model = parser.add_argument_group("the model")
     model.add_argument(
         "--camera-model",
@@ -167,6 +187,9 @@ def _add_board(commands: Any) -> None:
         metavar="N",
         help="hold every N-th frame out, each in turn, to measure the error on frames not seen (default: 5)",
     )
+
+
+def _add_what_is_used(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--take", action="append", metavar="NAME", help="only this take; may be given several times"
     )
@@ -205,8 +228,6 @@ def _add_board(commands: Any) -> None:
     parser.add_argument(
         "--jobs", type=whole_number(1), metavar="N", help="processes that find boards (default: all cores)"
     )
-    _add_output(parser, "for several takes a folder, which then holds rigs/TAKE.json")
-    parser.set_defaults(output=None)  # what it is depends on the number of takes
 
 
 def _add_photos(commands: Any) -> None:
@@ -264,16 +285,6 @@ def _add_output(parser: argparse.ArgumentParser, more: str) -> None:
     parser.add_argument(
         "--report", type=Path, metavar="PATH.html", help="default: beside the rig, as rig.report.html"
     )
-
-
-def _length(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a length in metres; write for example 0.022")
-    return value
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """``preface-calibrate board``: from pictures of a board to a rig per take, with corners and report beside it."""
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -21,6 +20,9 @@ from preface.capture.detection import DetectionOptions, detect_corners
 from preface.capture.manifest import Board
 from preface.capture.rig import write_rig
 from preface.capture.takes import calibrate_takes, drift, require_distance, without_cameras
+from preface.cli.folders import make_folder, require_writable
+from preface.cli.output import known_distance, say
+from preface.cli.rig_files import RIG_FILE, new_report_file, new_rig_file
 from preface.cli.usage import UsageError
 from preface.plain_words import suggestion
 
@@ -38,29 +40,25 @@ class _Job:
 def run(config: argparse.Namespace) -> list[str]:
     """Detect, solve, write the reports and then the rigs; returns the lines to print."""
     options = CalibrationOptions(config.camera_model, config.board_warp, config.held_out, config.backend)
-    board = _described(config)
+    board, distance = _described(config), known_distance(config.known_distance)
     takes = _takes(config)
-    paths = _rig_paths(config, takes)
-    jobs = [_job(config, take, board, path) for take, path in zip(takes, paths, strict=True)]
+    paths = _paths(config, takes)
+    jobs = [_job(config, take, board, *of_take) for take, of_take in zip(takes, paths, strict=True)]
     began = time.perf_counter()
     found = calibrate_takes({job.take.id: job.corners.observations for job in jobs}, options)
-    _say(f"calibrated in {time.perf_counter() - began:.1f} s")
-    if config.known_distance:
+    say(f"calibrated in {time.perf_counter() - began:.1f} s")
+    if distance:
         for calibration in found.values():
-            require_distance(calibration, *_known_distance(config.known_distance))
+            require_distance(calibration, *distance)
     began = time.perf_counter()
     lines = []
     for index, job in enumerate(jobs):
         for warning in found[job.take.id].warnings:
-            _say(f"note: take '{job.take.id}': {warning}")
+            say(f"note: take '{job.take.id}': {warning}")
         before = jobs[index - 1] if index else None
         lines += _write(config, job, found[job.take.id], _drifts(before, job, found))
-    _say(f"reported in {time.perf_counter() - began:.1f} s")
+    say(f"reported in {time.perf_counter() - began:.1f} s")
     return lines
-
-
-def _say(words: str) -> None:
-    print(words, file=sys.stderr, flush=True)
 
 
 # ------------------------------------------------------------------------------------ what is asked
@@ -106,7 +104,7 @@ def _takes(config: argparse.Namespace) -> list[CalibrationTake]:
     if config.corners and len(takes) > 1:
         raise UsageError(f"--corners holds one take: say which with --take ({', '.join(names)})")
     cameras = dict.fromkeys(camera for take in takes for camera in take.cameras)
-    for name in config.leave_out or ():
+    for name in (*(config.leave_out or ()), *(config.known_distance or ())[:2]):
         if name not in cameras:
             raise ArtifactError(
                 config.source, "cameras", f"there is no camera '{name}'", suggestion(name, cameras)
@@ -118,49 +116,38 @@ def _takes(config: argparse.Namespace) -> list[CalibrationTake]:
     ]
 
 
-def _rig_paths(config: argparse.Namespace, takes: Sequence[CalibrationTake]) -> list[Path]:
-    """Where the rigs go, and that it exists."""
+def _paths(config: argparse.Namespace, takes: Sequence[CalibrationTake]) -> list[tuple[Path, Path]]:
+    """Where each take's rig and report go, which can be written there."""
     many = len(takes) > 1
-    output = config.output or Path("." if many else "rig.json")
+    output = config.output or Path("." if many else RIG_FILE)
     if many and (output.suffix == ".json" or config.report):
         flag = "--report" if config.report else "--output"
         raise UsageError(
             f"{flag} names one file, but there are {len(takes)} takes: give a folder as --output, or one --take"
         )
-    if config.report and config.report.suffix != ".html":
-        raise UsageError(f"--report: {config.report} does not end in .html")
-    try:
-        if many:
-            (output / "rigs").mkdir(parents=True, exist_ok=True)
-            return [output / "rigs" / f"{take.id}.json" for take in takes]
-        path = output / "rig.json" if output.is_dir() or not output.suffix else output
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ArtifactError.from_os(error.filename or output, "writing", error) from error
-    return [path]
-
-
-def _known_distance(words: Sequence[str]) -> tuple[str, str, float]:
-    first, second, metres = words
-    try:
-        return first, second, float(metres)
-    except ValueError as error:
-        raise UsageError(f"--known-distance: '{metres}' is not a length in metres") from error
+    rigs = [output / "rigs" / f"{take.id}.json" for take in takes] if many else [new_rig_file(output)]
+    paths = [(rig, new_report_file(config.report, rig)) for rig in rigs]
+    for folder in dict.fromkeys(path.parent for both in paths for path in both):
+        require_writable(folder)
+    return paths
 
 
 # ------------------------------------------------------------------------------------------ corners
 
 
-def _job(config: argparse.Namespace, take: CalibrationTake, board: Board | None, rig_path: Path) -> _Job:
-    report_path = config.report or rig_path.with_suffix(".report.html")
+def _job(
+    config: argparse.Namespace, take: CalibrationTake, board: Board | None, rig_path: Path, report_path: Path
+) -> _Job:
+    """A take with its corners, which are kept where they were found now."""
     if config.corners:
         corners = _read(config, board)
     else:
         corners = _detected(config, take, board or take.board)
+        make_folder(rig_path.parent)
         path = write_corners(rig_path.with_suffix(".corners.json"), corners)
-        _say(f"corners: {path}")
+        say(f"corners: {path}")
     for warning in corners.warnings:
-        _say(f"note: {warning}")
+        say(f"note: {warning}")
     return _Job(take, corners, rig_path, report_path)
 
 
@@ -188,7 +175,7 @@ def _detected(config: argparse.Namespace, take: CalibrationTake, board: Board | 
     seen = int((corners.observations.counts > 0).sum())
     images = seen + len(corners.unseen)
     took = time.perf_counter() - began
-    _say(
+    say(
         f"take '{take.id}': the board is seen in {seen} of {images} images, {len(corners.observations):,} corners; "
         f"{took:.1f} s, {1e3 * took / max(images, 1):.0f} ms per image"
     )
@@ -235,6 +222,8 @@ def _write(
     of_pictures = (job.corners.provenance or {}).get("inputs", {})
     history = provenance(settings, {corners_path.name: corners_path})
     history["inputs"] |= of_pictures
+    for path in (job.rig_path, job.report_path):
+        make_folder(path.parent)
     load = image_loader(job.take, job.corners)
     report = calibration_report(job.take.id, calibration, history, load, drifts).write(job.report_path)
     rig = replace(calibration.rig(job.take.id), provenance=history)

@@ -1,7 +1,6 @@
 """``preface-calibrate photos``: from photographs of no particular arrangement to a rig and its report."""
 
 import argparse
-import sys
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -11,7 +10,9 @@ from preface.artifacts import provenance
 from preface.capture.photo_report import photo_report
 from preface.capture.photos import PhotoCalibration, PhotoOptions, calibrate_photos
 from preface.capture.rig import write_rig
-from preface.cli.usage import UsageError
+from preface.cli.folders import make_folder, require_writable
+from preface.cli.output import known_distance, say
+from preface.cli.rig_files import new_report_file, new_rig_file
 
 
 def run(config: argparse.Namespace) -> list[str]:
@@ -20,21 +21,23 @@ def run(config: argparse.Namespace) -> list[str]:
         cameras=config.cameras,
         take=config.take,
         masks=config.masks,
-        known_distance=_known_distance(config.known_distance),
+        known_distance=known_distance(config.known_distance),
         seed=config.seed,
         threads=config.jobs or 0,
     )
-    rig_path = config.output / "rig.json" if config.output.is_dir() else config.output
-    report_path = config.report or rig_path.with_suffix(".report.html")
-    if report_path.suffix != ".html":
-        raise UsageError(f"--report: {report_path} does not end in .html")
+    rig_path = new_rig_file(config.output)
+    report_path = new_report_file(config.report, rig_path)
+    for path in (rig_path, report_path):
+        require_writable(path.parent)
     began = time.perf_counter()
     found = calibrate_photos(config.source, options)
-    print(f"calibrated in {time.perf_counter() - began:.1f} s", file=sys.stderr)
+    say(f"calibrated in {time.perf_counter() - began:.1f} s")
     history = provenance(_plain(asdict(options)), _inputs(config.source, found), config.seed)
     rig = replace(found.rig, provenance=history)
     for warning in found.warnings:
-        print(f"note: {warning}", file=sys.stderr)
+        say(f"note: {warning}")
+    for path in (rig_path, report_path):
+        make_folder(path.parent)
     report = photo_report(replace(found, rig=rig)).write(report_path)
     chosen = found.candidates[found.chosen]
     held_out = "" if chosen.held_out_error is None else f", held out {chosen.held_out_error:.3f} px"
@@ -45,16 +48,6 @@ def run(config: argparse.Namespace) -> list[str]:
         f"report: {report}",
         str(write_rig(rig_path, rig)),
     ]
-
-
-def _known_distance(words: list[str] | None) -> tuple[str, str, float] | None:
-    if words is None:
-        return None
-    first, second, metres = words
-    try:
-        return first, second, float(metres)
-    except ValueError as error:
-        raise UsageError(f"--known-distance: '{metres}' is not a length in metres") from error
 
 
 def _inputs(source: Path, found: PhotoCalibration) -> dict[str, Path]:

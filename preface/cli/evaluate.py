@@ -9,7 +9,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from preface.cli.output import exit_status, whole_number
+from preface.cli.output import exit_status, interruptible, number
+from preface.cli.render_flags import add_device_flags
+from preface.cli.usage import Parser
 from preface.model.evaluation.options import FACE_HALF_SIDE, LPIPS_CHOICES
 from preface.model.pretrained import prior_flag
 from preface.model.rendering.shortcuts import QUALITIES
@@ -28,13 +30,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
     parser = _parser()
     config = parser.parse_args(arguments)
+    return interruptible(lambda: exit_status(lambda: _run(config), parser, config.shards))
+
+
+def _run(config: argparse.Namespace) -> list[str]:
     from preface.cli.evaluate_heads import run
 
-    return exit_status(lambda: run(config), parser, parser.prog, lambda: ())
+    return run(config)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("preface-evaluate", description=_DESCRIPTION, epilog=_EPILOG)
+    parser = Parser("preface-evaluate", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument(
         "heads",
         type=prior_flag,
@@ -63,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     how.add_argument(
         "--face-half-side",
-        type=_length,
+        type=number(1e-3, 10),
         default=FACE_HALF_SIDE,
         metavar="METRES",
         help=f"half the side of the square that is cropped about the face (default: {FACE_HALF_SIDE})",
@@ -83,22 +89,8 @@ def _parser() -> argparse.ArgumentParser:
         help="show normals on the sheets; no figure depends on them, and without them rendering takes some six tenths "
         "of the time (default: shown)",
     )
-    speed.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
-    speed.add_argument(
-        "--rays-at-a-time", type=whole_number(1), default=4096, metavar="N", help="memory goes with it"
-    )
+    add_device_flags(speed)
     return parser
-
-
-def _length(text: str) -> float:
-    """The type of a flag that takes metres, 1 mm to 10 m."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 1e-3 <= value <= 10:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a length from 0.001 to 10 metres")
-    return value
 
 
 if __name__ == "__main__":

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from preface.artifacts import ArtifactError, provenance, write_bytes
 from preface.capture.images import write_png
 from preface.cli.devices import usable_device
+from preface.cli.folders import make_folder, require_own, require_writable
 from preface.cli.output import say
 from preface.model.evaluation import tables
 from preface.model.evaluation.evaluate import EvaluatedView, evaluate_views, photograph_on_black
@@ -19,7 +18,7 @@ from preface.model.evaluation.figures import Judge, judge
 from preface.model.evaluation.metrics_file import METRICS_FILE, Measured, write_metrics
 from preface.model.evaluation.options import EvaluationOptions
 from preface.model.evaluation.page import HeadResult, evaluation_page
-from preface.model.evaluation.sheets import ERROR_SHOWN, face_sheet, sheet, view_pictures
+from preface.model.evaluation.sheets import face_sheet, sheet, view_pictures
 from preface.model.evaluation.views import (
     camera_names,
     choose_views,
@@ -29,11 +28,14 @@ from preface.model.evaluation.views import (
 )
 from preface.model.matmul import denormals_flushed, keep_freed_memory
 from preface.model.pretrained import prior_path
+from preface.model.rendering.showing import error_picture
 from preface.model.training.prior_files import Prior, read_prior
-from preface.reports.pictures import as_picture, colorize
+from preface.reports.pictures import as_picture
 from preface.shards import Dataset
 
 MARKDOWN_FILE, LATEX_FILE, PAGE_FILE = "metrics.md", "metrics.tex", "report.html"
+# What an evaluation leaves, an interrupted one, too.
+OF_AN_EVALUATION = (MARKDOWN_FILE, LATEX_FILE, f"*/{METRICS_FILE}", "*/*.truth.png")
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +65,10 @@ def run(config: argparse.Namespace) -> list[str]:
 
 def _evaluated(config: argparse.Namespace, dataset: Dataset, options: EvaluationOptions) -> list[str]:
     jobs = _jobs(config, dataset)
+    require_own(config.output, "an evaluation", OF_AN_EVALUATION)
     measure = judge(options.networks, usable_device(config.device))  # before anything takes time
-    folders = [_made(config.output / job.name) for job in jobs]
+    require_writable(config.output)
+    folders = [make_folder(config.output / job.name) for job in jobs]
     settings = {key: _plain(value) for key, value in vars(config).items() if value is not None}
     results = []
     for job, folder in zip(jobs, folders, strict=True):
@@ -121,14 +125,6 @@ def _names(heads: Sequence[str | Path]) -> list[str]:
     return [f"{number}-{name}" for number, name in enumerate(names)]
 
 
-def _made(folder: Path) -> Path:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ArtifactError.from_os(folder, "writing", error) from error
-    return folder
-
-
 def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
@@ -182,5 +178,4 @@ def _write_images(folder: Path, view: EvaluatedView) -> None:
     name = view.figures.name
     write_png(folder / f"{name}.truth.png", as_picture(view.truth))
     write_png(folder / f"{name}.png", as_picture(view.rgb))
-    error = np.abs(view.rgb - view.truth).mean(axis=-1)
-    write_png(folder / f"{name}.error.png", colorize(error, 0, ERROR_SHOWN, "inferno"))
+    write_png(folder / f"{name}.error.png", error_picture(view.rgb, view.truth))

@@ -16,16 +16,16 @@ from typing import Annotated, Any
 
 import tyro
 
-from preface.artifacts import ArtifactError
-from preface.cli.output import print_lines, say
+from preface.cli.output import say
+from preface.cli.training_runs import OF_A_RUN, run_to_end, training_status
 from preface.cli.typed_flags import parse_flags
 from preface.cli.usage import UsageError
-from preface.model.configuration import ConfigurationError
 from preface.model.fitting.configuration import QUALITIES, FitConfig, defaults
-from preface.model.training.configuration import TrainingConfigError
 
 DEFAULT_QUALITY = "balanced"
-INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+PROGRAM = "preface-fit"
+# What the stages before a fit leave in a head's folder when they are interrupted; `fit_photos` has their names.
+OF_PHOTOGRAPHS = ("photos/template.json", "photos/alignment", "photos/shards")
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class PhotographsConfig:
     masks: Path | None = None
     """Masks by the photographs' names, where there are some; otherwise they are found."""
     resolution: str = "auto"
-    """WIDTHxHEIGHT of the views to fit to. By default the prior's, cut out around the head; for --quality reference
+    """WIDTHxHEIGHT of the views to fit to. By default the prior's, cut out around the head; for --quality paper
     the largest multiple of it that the photographs have."""
 
 
@@ -74,22 +74,22 @@ class FitCommand(FitConfig):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
     command = parse(sys.argv[1:] if arguments is None else arguments)
-    try:
-        if is_shards(command.shards):
-            _require_no_photographs(command)
-            return _fit(command.fit(command.shards, command.identity, command.views))
+    return training_status(lambda: _fitted(command), PROGRAM, command.shards)
+
+
+def _fitted(command: FitCommand) -> int:
+    from preface.cli.folders import require_own
+
+    require_own(command.output, "a head", OF_A_RUN + OF_PHOTOGRAPHS)
+    if not is_shards(command.shards):
         return _fit_photographs(command)
-    except KeyboardInterrupt:  # before the first step, or a second time
-        return _complain("interrupted; the same command goes on from where it was", INTERRUPTED)
-    except UsageError as error:
-        return _complain(str(error), 2)
-    except ArtifactError as error:
-        return _complain(str(error), 1)
+    _require_no_photographs(command)
+    return _fit(command.fit(command.shards, command.identity, command.views))
 
 
 def parse(arguments: Sequence[str]) -> FitCommand:
     """The configuration that arguments ask for; ends the process for help and for wrong usage."""
-    first = argparse.ArgumentParser("preface-fit", add_help=False, allow_abbrev=False)
+    first = argparse.ArgumentParser(PROGRAM, add_help=False, allow_abbrev=False)
     first.add_argument("--quality", default=DEFAULT_QUALITY)
     name = first.parse_known_args(arguments)[0].quality
     # An unknown name is refused below, with the names that there are.
@@ -98,7 +98,7 @@ def parse(arguments: Sequence[str]) -> FitCommand:
     default = FitCommand(
         shards=tyro.MISSING, quality=quality, inversion=inversion, finetuning=finetuning, run=run
     )
-    return parse_flags(FitCommand, "preface-fit", arguments, default)
+    return parse_flags(FitCommand, PROGRAM, arguments, default)
 
 
 def is_shards(path: Path) -> bool:
@@ -117,18 +117,8 @@ def _require_no_photographs(command: FitCommand) -> None:
 
 def _fit(config: FitConfig) -> int:
     from preface.model.fitting.run import fit_head
-    from preface.model.matmul import denormals_flushed, keep_freed_memory
-    from preface.model.training.loop import TrainingError
 
-    keep_freed_memory()
-    try:
-        with denormals_flushed():
-            ended = fit_head(config, say)
-    except (TrainingConfigError, ConfigurationError) as error:
-        return _complain(str(error), 2)
-    except TrainingError as error:
-        return _complain(str(error), 1)
-    return print_lines([str(ended.path)] if ended.path.exists() else []) or ended.status
+    return run_to_end(lambda: fit_head(config, say))
 
 
 def _fit_photographs(command: FitCommand) -> int:
@@ -142,11 +132,6 @@ def _fit_photographs(command: FitCommand) -> int:
     status = _fit(command.fit(prepared.shards, prepared.identity, prepared.views))
     if status == 0:
         explain(prepared, command, say)
-    return status
-
-
-def _complain(message: str, status: int) -> int:
-    print(f"preface-fit: {message}", file=sys.stderr)
     return status
 
 

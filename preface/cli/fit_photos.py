@@ -26,9 +26,12 @@ from preface.artifacts import ArtifactError, provenance, sha256, write_bytes
 from preface.capture.images import IMAGE_SUFFIXES
 from preface.capture.upright import read_upright_header
 from preface.cli import align, build_shards
-from preface.cli.align_photos import RIG_FILE, SCHEME
+from preface.cli.align_inputs import template_file
+from preface.cli.align_photos import SCHEME
 from preface.cli.fit import FitCommand
+from preface.cli.folders import make_folder, require_writable
 from preface.cli.output import size
+from preface.cli.rig_files import RIG_FILE, one_rig_file
 from preface.cli.usage import UsageError
 from preface.model.fitting.configuration import MAX_VIEWS
 from preface.model.pretrained import PRETRAINED, flag_word
@@ -40,7 +43,7 @@ from preface.shards.manifest import read_manifest
 FOLDER = "photos"  # in the head's
 BASELINE_SIZE = (128, 192)  # of the views where there is no prior whose resolution could be taken
 MAX_MULTIPLE = (
-    8  # of the prior's resolution, for `reference`: beyond, a window around the head holds no more pixels
+    8  # of the prior's resolution, for `paper`: beyond, a window around the head holds no more pixels
 )
 
 Say = Callable[[str], None]
@@ -84,7 +87,7 @@ def prepare(command: FitCommand, say: Say) -> Prepared:
     resolution = view_size(command, prior, files)
     folder = command.output / FOLDER
     alignment, shards = folder / "alignment", folder / "shards"
-    _make(folder)
+    require_writable(make_folder(folder))
     template = _template(command, prior, folder, say)
     say(
         f"1 of 3: where {_photographs(len(files))} were taken from and where the face is (about half a minute)"
@@ -108,12 +111,15 @@ def prepare(command: FitCommand, say: Say) -> Prepared:
 def explain(prepared: Prepared, command: FitCommand, say: Say) -> None:
     """Say how far a head can be trusted, and write it down beside the shards."""
     from preface.cli.fit_trust import trust
+    from preface.model.fitting.run import PREVIEWS
 
-    found = trust(prepared.alignment, prepared.shards, command.from_prior)
+    preview = max((command.output / PREVIEWS).glob("views-*.png"))  # names hold the step, in eight digits
+    found = trust(prepared.alignment, prepared.shards, preview, command.from_prior)
     say("How far to trust it:")
     for sentence in found.sentences:
         say(f"    {sentence}")
-    say(str(found.report(provenance({}, found.inputs)).write(prepared.shards.parent / "trust.html")))
+    folder = prepared.shards.parent
+    say(str(found.report(provenance({}, found.inputs), folder).write(folder / "trust.html")))
 
 
 # ------------------------------------------------------------------------------------- what is asked
@@ -146,7 +152,7 @@ def photographs(source: Path, names: Sequence[str]) -> list[Path]:
 
 
 def view_size(command: FitCommand, prior: Prior | None, files: Sequence[Path]) -> tuple[int, int]:
-    """Width and height of the views to fit to: the prior's, which its box fills, in whole multiples for `reference`.
+    """Width and height of the views to fit to: the prior's, which its box fills, in whole multiples for `paper`.
 
     Smaller photographs are never enlarged.
 
@@ -163,15 +169,14 @@ def view_size(command: FitCommand, prior: Prior | None, files: Sequence[Path]) -
     room = min(min(header.width / width, header.height / height) for header in headers)
     if room < 1:
         return max(1, math.floor(width * room)), max(1, math.floor(height * room))
-    multiple = min(math.floor(room), MAX_MULTIPLE) if command.quality == "reference" else 1
+    multiple = min(math.floor(room), MAX_MULTIPLE) if command.quality == "paper" else 1
     return multiple * width, multiple * height
 
 
 def _template(command: FitCommand, prior: Prior | None, folder: Path, say: Say) -> Path:
     """The template to place the face on: the prior's where it is known."""
     if command.photos.template is not None:
-        given = command.photos.template
-        return given / TEMPLATE_FILE if given.is_dir() else given
+        return template_file(command.photos.template)
     if prior is not None:
         beside = prior.path.parent / TEMPLATE_FILE
         if beside.exists():
@@ -263,12 +268,5 @@ def is_aligned(folder: Path, files: Sequence[Path], template: Path, cameras: Pat
     inputs = (read_index(folder).provenance or {}).get("inputs", {})
     wanted = [*files, template]
     if cameras is not None:
-        wanted.append(cameras / RIG_FILE if cameras.is_dir() else cameras)
+        wanted.append(one_rig_file(cameras))
     return sorted(inputs.values()) == sorted(sha256(file) for file in wanted)
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ArtifactError.from_os(folder, "writing", error) from error

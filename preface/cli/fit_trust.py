@@ -1,11 +1,13 @@
 """How far a head from a few photographs can be trusted: what they settle, and what stands in for what they do not.
 
-The numbers are those of the alignment's report and of the shards; nothing is measured anew but angles between views.
+The numbers are those of the alignment's report and of the shards, the picture of the head is the fit's last preview;
+nothing is measured anew but angles between views.
 """
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,13 +16,18 @@ from typing import Any
 import numpy as np
 
 from preface.align.photos.trust import NAMES as KEYPOINTS
+from preface.align.photos.views import HARDLY
 from preface.artifacts import ArtifactError, load_json
 from preface.capture.foreground.sheet import MaskFigures, worst_first
-from preface.reports import Report
+from preface.capture.images import read_image
+from preface.reports import Link, Report, contact_sheet
+from preface.reports.pictures import Picture
 from preface.shards import Dataset
+from preface.shards.dataset.finishing import MASKS_FILE
 from preface.shards.dataset.heads import mask_figures
 
-REPORT_FILE = "report.json"  # of an alignment
+REPORT_FILE, REPORT_PAGE = "report.json", "report.html"  # of an alignment
+THUMBNAIL_HEIGHT = 240  # pixels, of a view
 # The column of the alignment's report that says what a number rests on, in the alignment's words, and ours for them.
 SOURCE = "rests on"
 SOURCES = {
@@ -29,12 +36,11 @@ SOURCES = {
     "given": "Given by you",
     "expectation": "From what is usual of faces and of phones",
     "assumption": "Assumed",
+    HARDLY: "Hardly settled by the photographs",
 }
 # Less than this between the outermost views shows depth by small displacements only: at half a metre and 20 degrees,
 # a centimetre of depth moves a point by 3.5 mm.
 NARROW, WIDE = math.radians(20), math.radians(45)
-# A deviation of more than this share of its number is no settled number, whatever it rests on.
-LOOSE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +52,9 @@ class Trust:
         views: on the number of views and where they are.
         masks: on the masks.
         rows: of the table of views.
+        thumbnails: the views that were fitted to, on black by their masks, with their names.
+        preview: picture of the head beside the views.
+        alignment, shards: folders, whose pages tell more.
         inputs: name -> file of what it was read from.
     """
 
@@ -53,6 +62,10 @@ class Trust:
     views: tuple[str, ...]
     masks: tuple[str, ...]
     rows: tuple[Mapping[str, Any], ...]
+    thumbnails: tuple[tuple[Picture, str], ...]
+    preview: Path
+    alignment: Path
+    shards: Path
     inputs: Mapping[str, Path]
 
     @property
@@ -60,27 +73,58 @@ class Trust:
         """All of them."""
         return (*self.numbers, *self.views, *self.masks)
 
-    def report(self, provenance: Mapping[str, Any]) -> Report:
-        """The same as a page."""
+    def report(self, provenance: Mapping[str, Any], folder: Path) -> Report:
+        """The same as a page, which is to lie in a folder.
+
+        Raises:
+            ArtifactError: the preview cannot be read.
+        """
+
+        def link(words: str, page: Path) -> Link:
+            return Link(words, Path(os.path.relpath(page, folder)).as_posix())
+
         report = Report("How far this head can be trusted", provenance)
-        report.section("What each number rests on").text("\n\n".join(self.numbers))
+        report.section("The head").image(
+            read_image(self.preview),
+            "By row, one of the views: the photograph, the head rendered there, their difference, depth, normals, and "
+            "the head from a new view.",
+            "The head as it was found, rendered beside the photographs",
+            "png",
+        )
+        section = report.section("What each number rests on")
+        section.text("\n\n".join(self.numbers))
+        section.links([link("report.html of the alignment: all its numbers", self.alignment / REPORT_PAGE)])
         section = report.section("Views")
         section.text("\n\n".join(self.views))
+        height, width = self.thumbnails[0][0].shape[:2]
+        section.image(
+            contact_sheet(
+                self.thumbnails,
+                len(self.thumbnails),
+                (round(THUMBNAIL_HEIGHT * width / height), THUMBNAIL_HEIGHT),
+            ),
+            f"The views at the {width}x{height} pixels that were fitted to, on black by their masks.",
+            "The photographs, cut out around the head",
+            "jpeg",
+        )
         section.table(
             self.rows,
             "Where the views were taken from, to the subject's left and up, and their masks",
-            units={"to the left": "°", "up": "°", "mask contradicts the others": "%"},
+            units={"to the left": "°", "up": "°", "mask off the hull": "%"},
         )
-        report.section("Masks").text("\n\n".join(self.masks))
+        section = report.section("Masks")
+        section.text("\n\n".join(self.masks))
+        section.links([link("masks.html of the shards: the edges of the masks", self.shards / MASKS_FILE)])
         return report
 
 
-def trust(alignment: Path, shards: Path, from_prior: bool) -> Trust:
+def trust(alignment: Path, shards: Path, preview: Path, from_prior: bool) -> Trust:
     """Put together what is known.
 
     Args:
         alignment: folder, written by ``preface-align photos``.
         shards: folder, of one identity.
+        preview: the fit's last picture.
         from_prior: whether a prior of heads was there to fill in what no photograph shows.
 
     Raises:
@@ -94,7 +138,8 @@ def trust(alignment: Path, shards: Path, from_prior: bool) -> Trust:
         cameras = [str(entry.cameras[view]) for view in valid]
         metadata = dataset.shards[0].people[0]["metadata"]
         masks = [mask_figures(entry.identity, camera, metadata) for camera in cameras]
-        inputs = {"report.json": file, "manifest.json": dataset.manifest.path}
+        thumbnails = tuple((_on_black(dataset.pixels(0, view)), str(entry.cameras[view])) for view in valid)
+        inputs = {"report.json": file, "manifest.json": dataset.manifest.path, preview.name: preview}
     azimuth, elevation = directions(centers)
     rows = tuple(
         {
@@ -102,7 +147,7 @@ def trust(alignment: Path, shards: Path, from_prior: bool) -> Trust:
             "to the left": math.degrees(left),
             "up": math.degrees(up),
             "mask": mask.method,
-            "mask contradicts the others": 100 * mask.disagreement,
+            "mask off the hull": 100 * mask.disagreement,
         }
         for camera, left, up, mask in zip(cameras, azimuth, elevation, masks, strict=True)
     )
@@ -111,8 +156,17 @@ def trust(alignment: Path, shards: Path, from_prior: bool) -> Trust:
         views=tuple(_views(azimuth, widest_angle(centers), from_prior)),
         masks=tuple(_masks(masks)),
         rows=rows,
+        thumbnails=thumbnails,
+        preview=preview,
+        alignment=alignment,
+        shards=shards,
         inputs=inputs,
     )
+
+
+def _on_black(pixels: np.ndarray) -> Picture:
+    """Colour by coverage of a view uint8 [H, W, 4]."""
+    return np.rint(pixels[..., :3] * (pixels[..., 3:] / 255.0)).astype(np.uint8)
 
 
 def directions(centers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -147,14 +201,11 @@ def _tables(file: Path) -> list[Sequence[Mapping[str, Any]]]:
 def _numbers(tables: Sequence[Sequence[Mapping[str, Any]]]) -> list[str]:
     """Which numbers rest on what."""
     rows = [row for table in tables for row in table if SOURCE in row]
-    loose = [row for row in rows if row[SOURCE] == "photographs" and _is_loose(row)]
     sentences = []
     for source, words in SOURCES.items():
-        named = [_quantity(row) for row in rows if row[SOURCE] == source and row not in loose]
+        named = [_quantity(row) for row in rows if row[SOURCE] == source]
         if named:
             sentences.append(f"{words}: {'; '.join(named)}.")
-    if loose:
-        sentences.append(f"Hardly settled by the photographs: {'; '.join(map(_quantity, loose))}.")
     shares = [
         row["from the photographs"] for table in tables for row in table if "from the photographs" in row
     ]
@@ -164,13 +215,6 @@ def _numbers(tables: Sequence[Sequence[Mapping[str, Any]]]) -> list[str]:
             f"{min(shares):.0f}% to {max(shares):.0f}%; the expected face stands for the rest."
         )
     return sentences
-
-
-def _is_loose(row: Mapping[str, Any]) -> bool:
-    value, deviation = row.get("value"), row.get("±")
-    if not isinstance(value, int | float) or not isinstance(deviation, int | float):
-        return False
-    return deviation > LOOSE * abs(value)
 
 
 def _quantity(row: Mapping[str, Any]) -> str:

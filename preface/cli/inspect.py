@@ -1,16 +1,18 @@
 """``preface-inspect``: validate artefacts, summarise them, and say what is wrong with them."""
 
 import json
-import os
 import sys
-from argparse import ArgumentParser
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from preface.artifacts import ArtifactError, load_json, read_artifact
+from preface.cli.inspect_exports import RAYS, TRANSFORMS
+from preface.cli.inspect_folders import artifacts_at
+from preface.cli.output import interruptible, print_lines, say
+from preface.cli.usage import Parser
 from preface.model.pretrained import prior_flag, prior_path
 from preface.plain_words import shown, suggestion
 
@@ -24,24 +26,10 @@ _DESCRIPTION = (
 )
 _EPILOG = "Exit status: 0 when all is well, 1 when something is wrong, 2 for wrong usage."
 _PATH_HELP = (
-    "an artefact, or a folder of a capture, a rig, an alignment, shards, a prior, a head or its figures; `pretrained` "
-    "is the prior that comes with preface"
+    "an artefact, or a folder of a capture, a rig, an alignment, shards, a prior, a head or its figures, an evaluation "
+    "or an export; `pretrained` is the prior that comes with preface"
 )
 MAX_LISTED = 20  # problems and missing views beyond this are counted; --json lists them all
-
-
-# What files of these names in a folder are.
-_NAMES = {
-    "capture.json": "preface/capture",
-    "corners.json": "preface/corners",
-    "rig.json": "preface/rig",
-    "alignment.json": "preface/alignment-index",
-    "template.json": "preface/template",
-    "manifest.json": "preface/shards",
-    "model.json": "preface/prior",
-    "metrics.json": "preface/metrics",
-}
-_SHARDS = "shard-*.safetensors"
 
 
 @dataclass
@@ -61,60 +49,37 @@ class Report:
     problems: list[ArtifactError] = field(default_factory=list)
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
-    parser = ArgumentParser("preface-inspect", description=_DESCRIPTION, epilog=_EPILOG)
+    parser = Parser("preface-inspect", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("paths", metavar="PATH", nargs="+", type=prior_flag, help=_PATH_HELP)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     config = parser.parse_args(arguments)
-    reports = [report for path in config.paths for report in inspect(path)]
-    text = _as_json(reports) if config.json else _as_text(reports)
+    return interruptible(lambda: _told(config.paths, as_json=config.json))
+
+
+def _told(paths: Sequence[str | Path], *, as_json: bool) -> int:
+    """Inspect artefacts and print what was found; 1 if anything is wrong."""
+    reports = [report for path in paths for report in inspect(path)]
     problems = [problem for report in reports for problem in report.problems]
-    status = 1 if problems else 0
-    if not _print(text):
+    if print_lines([_as_json(reports) if as_json else _as_text(reports)]) != 0:
         return 1
-    if not config.json:
+    if not as_json:
         for problem in problems[:MAX_LISTED]:
-            print(_printable(str(problem), sys.stderr), file=sys.stderr)
+            say(str(problem))
         if len(problems) > MAX_LISTED:
-            print(f"... and {len(problems) - MAX_LISTED} more problems; --json lists all", file=sys.stderr)
-    return status
+            say(f"... and {len(problems) - MAX_LISTED} more problems; --json lists all")
+    return 1 if problems else 0
 
 
 def inspect(path: str | Path) -> list[Report]:
     """Inspect one artefact, or all those of a folder; the text `pretrained` is the prior that comes with preface."""
     try:
-        return [_inspect_artifact(report) for report in _artifacts(prior_path(path))]
+        return [_inspect_artifact(Report(*found)) for found in artifacts_at(prior_path(path))]
     except ArtifactError as error:
         return [Report(Path(path), problems=[error])]
     except OSError as error:
         return [Report(Path(path), problems=[ArtifactError.from_os(path, "file", error)])]
-
-
-def _artifacts(path: Path) -> list[Report]:
-    """Empty reports for the artefacts at a path; in a folder, their names say their schemas."""
-    if not path.is_dir():
-        return [Report(path, "preface/shard" if path.match(_SHARDS) else None)]
-    found = [Report(path / name, schema) for name, schema in _NAMES.items() if os.path.lexists(path / name)]
-    # Shards and the priors trained on them carry a copy of the alignment's template, which is not what is meant.
-    if list(path.glob(_SHARDS)) or os.path.lexists(path / "model.json"):
-        found = [report for report in found if report.schema != "preface/template"]
-    if (path / "subjects").is_dir() and not os.path.lexists(path / "capture.json"):
-        found.insert(0, Report(path, "preface/capture"))  # its manifest is inferred
-    if not found and list(path.glob(_SHARDS)):
-        problem = "holds shards and no manifest.json: building was not finished"
-        raise ArtifactError(path, "folder", problem, "Run preface-build-shards again")
-    if not found:
-        problem = f"holds none of {', '.join(_NAMES)}, nor a folder subjects"
-        raise ArtifactError(path, "folder", problem, _name_one(path))
-    return found
-
-
-def _name_one(folder: Path) -> str:
-    """The remedy for a folder that holds nothing of its own: what is in it, such as a head's figures or rigs."""
-    deeper = sorted(file.parent for name in _NAMES for file in folder.glob(f"*/{name}"))
-    perhaps = [*deeper, *sorted(folder.glob("*.json"))]
-    return f"Name an artefact or the folder that holds it{f', such as {perhaps[0]}' if perhaps else ''}"
 
 
 def _inspect_artifact(report: Report) -> Report:
@@ -131,6 +96,8 @@ def _inspect_artifact(report: Report) -> Report:
         "preface/metrics": _summarise_metrics,
         "preface/shards": _summarise_shards,
         "preface/shard": _summarise_shards,
+        RAYS: _summarise_export,
+        TRANSFORMS: _summarise_export,
     }
     try:
         if report.schema is None:
@@ -313,6 +280,18 @@ def _summarise_shards(report: Report) -> None:
     report.summary = summarise(report.path, report.problems)
 
 
+# ----------------------------------------------------------------------------------------- exports
+
+
+def _summarise_export(report: Report) -> None:
+    from preface.cli import inspect_exports
+
+    if report.schema == RAYS:
+        report.summary = inspect_exports.summarise_rays(report.path)
+    else:
+        report.summary = inspect_exports.summarise_transforms(report.path, report.problems)
+
+
 # ------------------------------------------------------------------------------------------ output
 
 
@@ -330,7 +309,7 @@ def _as_json(reports: list[Report]) -> str:
         }
         for report in reports
     ]
-    return json.dumps({"ok": all(a["ok"] for a in artifacts), "artifacts": artifacts}, indent=2) + "\n"
+    return json.dumps({"ok": all(a["ok"] for a in artifacts), "artifacts": artifacts}, indent=2)
 
 
 def _as_text(reports: list[Report]) -> str:
@@ -340,7 +319,7 @@ def _as_text(reports: list[Report]) -> str:
         verdict = "valid" if not count else f"{count} problem{'s' if count > 1 else ''}"
         lines.append(f"{report.path}: {report.schema or 'unknown kind'}: {verdict}")
         lines += [f"  {key.replace('_', ' '):<30}{_cell(value)}" for key, value in report.summary.items()]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)
 
 
 def _cell(value: Any) -> str:
@@ -359,27 +338,6 @@ def _cell(value: Any) -> str:
     if isinstance(value[0], dict):
         return str(len(value)) + "".join(f"\n    {_cell(item)}" for item in value)
     return f"{len(value)}: " + ", ".join(map(str, value[:MAX_LISTED])) + rest
-
-
-def _print(text: str) -> bool:
-    """Print to standard output; False, with the reason on standard error, when it takes no more."""
-    try:
-        sys.stdout.write(_printable(text, sys.stdout))
-        sys.stdout.flush()
-    except BrokenPipeError:  # the reader, such as `head`, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except OSError as error:
-        print(ArtifactError.from_os("standard output", "writing", error), file=sys.stderr)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return False
-    return True
-
-
-def _printable(text: str, stream: Any) -> str:
-    """Replace control codes, and characters that the stream's encoding lacks, by escapes."""
-    clean = "".join(c if c == "\n" or c.isprintable() else repr(c)[1:-1] for c in text)
-    encoding = stream.encoding or "utf-8"
-    return clean.encode(encoding, "backslashreplace").decode(encoding)
 
 
 if __name__ == "__main__":

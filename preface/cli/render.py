@@ -5,13 +5,13 @@ This module reads the command line; `render_frames` does the work and is importe
 """
 
 import argparse
-import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from preface.cli.output import exit_status, size, whole_number
-from preface.cli.render_shortcuts import add_quality_flags
+from preface.cli.output import exit_status, interruptible, number, size, whole_number
+from preface.cli.render_flags import add_device_flags, add_quality_flags
+from preface.cli.usage import Parser
 from preface.model.pretrained import prior_flag
 
 _DESCRIPTION = "Render what a model knows of a head: colour, opacity, depth and normals."
@@ -22,14 +22,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
     parser = _parser()
     config = parser.parse_args(arguments)
+    return interruptible(lambda: exit_status(lambda: _run(config), parser, config.model, _reasons))
+
+
+def _run(config: argparse.Namespace) -> list[str]:
     from preface.cli.render_frames import run
+
+    return run(config)
+
+
+def _reasons() -> tuple[type[Exception], ...]:
+    """Errors that tell a user what to do; anything else is a defect of this program."""
     from preface.geometry import GeometryError
 
-    return exit_status(lambda: run(config), parser, parser.prog, lambda: (GeometryError,))
+    return (GeometryError,)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("preface-render", description=_DESCRIPTION, epilog=_EPILOG)
+    parser = Parser("preface-render", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument(
         "model",
         type=prior_flag,
@@ -58,20 +68,31 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         help="<identity>.json that carries the rig of --cameras to the canonical frame (default: it is that frame)",
     )
+    _add_the_orbit(parser)
+    _add_what_is_written(parser)
+    add_device_flags(parser.add_argument_group("speed"))
+    add_quality_flags(parser)
+    return parser
+
+
+def _add_the_orbit(parser: argparse.ArgumentParser) -> None:
     path = parser.add_argument_group("the orbit")
     path.add_argument(
-        "--azimuth", type=_number(0, 180), default=40.0, help="degrees to either side, 180: all around"
+        "--azimuth", type=number(0, 180), default=40.0, help="degrees to either side, 180: all around"
     )
-    path.add_argument("--elevation", type=_number(-85, 85), default=10.0, help="degrees up and down")
+    path.add_argument("--elevation", type=number(-85, 85), default=10.0, help="degrees up and down")
     path.add_argument(
-        "--distance", type=_number(1e-3, 1e3), default=1.0, help="metres from the middle of the box"
+        "--distance", type=number(1e-3, 1e3), default=1.0, help="metres from the middle of the box"
     )
+
+
+def _add_what_is_written(parser: argparse.ArgumentParser) -> None:
     image = parser.add_argument_group("the images")
     image.add_argument(
         "--size", type=size, metavar="WxH", help="of an orbit's images (default: those of training)"
     )
     image.add_argument(
-        "--background", type=_number(0, 1), default=0.0, help="grey value behind the head, 0 to 1"
+        "--background", type=number(0, 1), default=0.0, help="grey value behind the head, 0 to 1"
     )
     image.add_argument("--no-normals", action="store_true", help="save the time that normals take")
     image.add_argument("--no-exr", action="store_true", help="PNG only")
@@ -87,33 +108,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     mesh.add_argument(
         "--surface",
-        type=_number(1e-3, 0.999),
+        type=number(1e-3, 0.999),
         default=0.5,
         metavar="OPACITY",
         help="the surface is where a centimetre stops this share of the light",
     )
-    speed = parser.add_argument_group("speed")
-    speed.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
-    speed.add_argument(
-        "--rays-at-a-time", type=whole_number(1), default=4096, metavar="N", help="memory goes with it"
-    )
-    add_quality_flags(parser)
-    return parser
-
-
-def _number(low: float, high: float) -> Callable[[str], float]:
-    """The type of a flag that takes a number within limits."""
-
-    def number(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"'{text}' is not a number from {low:g} to {high:g}")
-        return value
-
-    return number
 
 
 if __name__ == "__main__":

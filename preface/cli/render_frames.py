@@ -13,27 +13,32 @@ import torch
 from torch import Tensor
 
 from preface.align.person_file import read_alignment
-from preface.artifacts import ArtifactError, provenance
+from preface.artifacts import ArtifactError, load_json, provenance
 from preface.capture.formats import read_rig_from
-from preface.capture.images import write_exr, write_png
+from preface.capture.images import IMAGE_SUFFIXES, write_exr, write_png
 from preface.capture.rig import Rig, RigCamera, read_rig, write_rig
 from preface.cli.devices import usable_device
+from preface.cli.folders import make_folder, require_own, require_writable
 from preface.cli.output import say
-from preface.cli.render_shortcuts import chosen_shortcuts
+from preface.cli.render_flags import chosen_shortcuts
+from preface.cli.rig_files import one_rig_file
 from preface.cli.usage import UsageError
 from preface.geometry import Box, Camera, Rigid
 from preface.model.matmul import choose_route, denormals_flushed, keep_freed_memory
 from preface.model.model import PriorModel
+from preface.model.rendering.accelerated import precision_of
 from preface.model.rendering.image import RenderedImage, RenderRays, Space, render_image, space_of
 from preface.model.rendering.mesh import MESH_SUFFIXES, extract_mesh, model_field, voxel_side, write_mesh
 from preface.model.rendering.paths import framing_camera, on_sphere, orbit
 from preface.model.rendering.shortcuts import Shortcuts, accelerate
+from preface.model.rendering.showing import normals_picture
 from preface.model.training.prior_files import Prior, read_prior
 from preface.plain_words import suggestion
 from preface.reports.pictures import Picture, as_picture, colorize
 from preface.shards.writer import box_depths
 
 CAMERAS_FILE, VIDEO_FILE = "rig.json", "orbit.webm"
+CANONICAL = "canonical"  # the take of the cameras that were written here
 FRAMES_PER_SECOND = 24
 SECONDS_BETWEEN = 10.0  # between two lines about one image
 
@@ -55,13 +60,12 @@ def _rendered(config: argparse.Namespace) -> list[str]:
     frames = _cameras(config, prior, box)
     codes = _codes(config, prior, len(frames))
     model = prior.load_model().to(device)
-    try:
-        config.output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ArtifactError.from_os(config.output, "writing", error) from error
+    _require_place(config.output)
+    require_writable(config.output)
     meshed = _mesh(config, model, space, codes[0]) if config.mesh is not None else []
     if shortcuts != Shortcuts():  # exact to rounding, but what is fastest may differ from run to run
-        choose_route(shortcuts.matmul or model.config.matmul, device, model.nerf.width).apply()
+        choose_route(precision_of(model, shortcuts), device, model.nerf.width).apply()
+    make_folder(config.output)
     video, progress = _Video(config.output / VIDEO_FILE) if config.video else None, _Progress(frames)
     renderers = _renderers(model, space, codes, shortcuts, config.background, not config.no_normals)
     for (name, (camera, pose)), render in zip(frames.items(), renderers, strict=True):
@@ -81,9 +85,26 @@ def _rendered(config: argparse.Namespace) -> list[str]:
     settings = {key: str(value) for key, value in vars(config).items() if value is not None}
     cameras = {name: RigCamera.at(camera, pose.inverse) for name, (camera, pose) in frames.items()}
     history = provenance(settings, {"model.json": prior.path})
-    written = write_rig(config.output / CAMERAS_FILE, Rig("canonical", cameras, provenance=history))
+    written = write_rig(config.output / CAMERAS_FILE, Rig(CANONICAL, cameras, provenance=history))
     lines = [str(video.finish())] if video is not None else []
     return [*meshed, *lines, str(written)]
+
+
+def _require_place(folder: Path) -> None:
+    """Refuse a folder with others' pictures, which these would join or replace, or with the rig of a capture.
+
+    Raises:
+        ArtifactError: naming what is there.
+    """
+    cameras = folder / CAMERAS_FILE
+    if cameras.is_file() and load_json(cameras).get("take") == CANONICAL:
+        return
+    require_own(
+        folder,
+        "renders",
+        ("*.alpha.png",),
+        lambda entry: entry.name == CAMERAS_FILE or entry.suffix.lower() in IMAGE_SUFFIXES,
+    )
 
 
 def _renderers(
@@ -139,6 +160,7 @@ def _code(model: PriorModel, weights: np.ndarray) -> Tensor | None:
 
 def _mesh(config: argparse.Namespace, model: PriorModel, space: Space, weights: np.ndarray) -> list[str]:
     """Write the surface of the first frame's code."""
+    require_writable(config.mesh.parent)
     field = model_field(model, _code(model, weights), voxel_side(space, config.mesh_resolution))
     try:
         mesh = extract_mesh(field, space, config.mesh_resolution, config.surface, model.codes.device)
@@ -148,6 +170,7 @@ def _mesh(config: argparse.Namespace, model: PriorModel, space: Space, weights: 
             config.model, field_name, problem, "Train or fit further, or lower --surface"
         ) from error
     say(f"mesh: {len(mesh.triangles)} triangles")
+    make_folder(config.mesh.parent)
     return [str(write_mesh(config.mesh, mesh))]
 
 
@@ -172,20 +195,25 @@ def _cameras(config: argparse.Namespace, prior: Prior, box: Box) -> dict[str, tu
 def _given_cameras(config: argparse.Namespace) -> dict[str, tuple[Camera, Rigid]]:
     if config.size is not None:
         raise UsageError("--size is that of an orbit; the cameras of --cameras have sizes of their own")
-    try:
-        rig = read_rig(config.cameras)
-    except ArtifactError as error:
-        if config.cameras.suffix == ".json" and config.cameras.name.startswith("rig"):
-            raise
-        try:
-            rig = read_rig_from(config.cameras)
-        except ArtifactError as other:
-            raise other from error
+    rig = _rig(config.cameras)
     poses = {name: camera.camera_from_rig.inverse for name, camera in rig.cameras.items()}
     if config.alignment is not None:
         carry = read_alignment(config.alignment).placement.canonical_from_rig.apply_to_pose
         poses = {name: carry(pose) for name, pose in poses.items()}
     return {name: (rig.cameras[name].camera, pose) for name, pose in poses.items()}
+
+
+def _rig(path: Path) -> Rig:
+    """A rig of ours, or of a format that preface-calibrate imports."""
+    try:
+        return read_rig(one_rig_file(path))
+    except ArtifactError as error:
+        if path.match("rig*.json") or any(path.glob("rigs/*.json")):
+            raise
+        try:
+            return read_rig_from(path)
+        except ArtifactError as other:
+            raise other from error
 
 
 # -------------------------------------------------------------------------------------------- who
@@ -208,10 +236,8 @@ def _codes(config: argparse.Namespace, prior: Prior, frames: int) -> np.ndarray:
 
 def _index(prior: Prior, name: str) -> int:
     if name not in prior.identities:
-        hint = suggestion(name, prior.identities)
-        raise ArtifactError(
-            prior.path, "identities", f"there is no '{name}'", hint or "Choose one that is there"
-        )
+        problem = f"there is no '{name}'"
+        raise ArtifactError(prior.path, "identities", problem, suggestion(name, prior.identities))
     return prior.identities.index(name)
 
 
@@ -227,8 +253,7 @@ def _write(folder: Path, name: str, image: RenderedImage, box: Box, pose: Rigid,
     write_png(folder / f"{name}.depth.png", colorize(image.depth, near, far, "viridis"))
     channels: dict[str, Any] = {"Z": image.depth}
     if image.normals is not None:
-        shown = np.where(np.isnan(image.normals), 0.0, (image.normals + 1) / 2)
-        write_png(folder / f"{name}.normals.png", as_picture(shown.astype(np.float32)))
+        write_png(folder / f"{name}.normals.png", normals_picture(image.normals))
         channels |= {f"N.{axis}": np.ascontiguousarray(image.normals[..., i]) for i, axis in enumerate("XYZ")}
     if exr:
         colors = {c: np.ascontiguousarray(image.rgb[..., i]) for i, c in enumerate("RGB")}

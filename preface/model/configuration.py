@@ -87,6 +87,10 @@ class ModelConfig:
     def __post_init__(self) -> None:
         _check(self)
 
+    def within_the_box(self) -> ModelConfig:
+        """What heads are, and how all models are rendered: between the faces of the box, in front of black."""
+        return dataclasses.replace(self, clip_to_box=True, background="black")
+
     def resolved(self, smallest_radius: float) -> ModelConfig:
         """The same with `levels` as a number: see `carried_levels` for the argument."""
         if self.levels != "auto":

@@ -40,7 +40,7 @@ class Render:
         acc: [n], opacity.
         distance_mean, distance_median: [n], in ray parameters; `far` of rays that were not evaluated.
         normals: [m, k, 3], of the density; None where not asked for.
-        normals_pred: [m, k, 3], predicted; None without the head.
+        normals_pred: [m, k, 3], predicted; None without the head, or where not asked for.
         evaluated: int64 [m], the rays evaluated; None where all were.
     """
 
@@ -113,7 +113,7 @@ class PriorModel(nn.Module):
         train_frac: float = 1.0,
         jitter: Tensor | None = None,
         background: Tensor | float | None = None,
-        normals: bool | None = None,
+        normals: bool = False,
     ) -> Render:
         """Render rays.
 
@@ -125,7 +125,7 @@ class PriorModel(nn.Module):
             jitter: [n, rounds] in [0, 1), where each ray's samples lie in their intervals; None for the
                 middle, which makes the result a function of rays and parameters.
             background: [n, 3] or a number, behind the model; black by default.
-            normals: whether to find the density's normals; by default if the head is there to learn them.
+            normals: whether to find the density's normals and, by the head that predicts them, those.
 
         Raises:
             ValueError: codes that do not fit the model or the rays.
@@ -142,9 +142,8 @@ class PriorModel(nn.Module):
         levels = self._propose(some, proposal, train_frac, jitter)
         last = len(self.config.samples) - 1
         sdist, tdist = self._place(some, levels, last, train_frac, jitter)
-        wanted = self.config.predicted_normals if normals is None else normals
         biases = self.nerf.biases(code, group, len(some))
-        features, raw, found = self._final(some, tdist, biases, wanted)
+        features, raw, found = self._final(some, tdist, biases, normals)
         levels = (*levels, self._level(some, sdist, tdist, raw))
         depth = len(self.nerf.layers)
         view = coord.pos_enc(some.viewdirs, 0, self.config.view_levels)

@@ -184,8 +184,8 @@ class Report:
     Args:
         title: shown on top and in the browser's tab.
         provenance: where the numbers come from: configuration, versions, seed, hashes of the inputs; any
-            nesting of mappings and sequences. Leave times of day out where the same input should give
-            the same bytes.
+            nesting of mappings and sequences. The page leaves out what there is none of. Leave times of day
+            out where the same input should give the same bytes.
     """
 
     def __init__(self, title: str, provenance: Mapping[str, Any]):
@@ -208,7 +208,8 @@ class Report:
 
     def html(self) -> str:
         """The page."""
-        return _template().render(report=self, provenance=_flattened(self.provenance))
+        known = {name: item for name, item in self.provenance.items() if item not in (None, {}, [])}
+        return _template().render(report=self, provenance=_flattened(known))
 
     def write(self, path: Path) -> Path:
         """Writes ``NAME.html`` and then ``NAME.json`` beside it, each atomically.

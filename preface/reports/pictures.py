@@ -26,6 +26,7 @@ GREEN: Color = (80, 230, 120)
 CHECKER = (108, 148)  # two greys that are told apart from the ends of every colour map used here
 CHECKER_CELL = 8
 GAP = 6  # pixels between tiles
+CAPTION_LINES = 2
 SMALLEST_FONT = 11  # pixels; below this, digits are no longer told apart
 
 
@@ -60,7 +61,8 @@ def contact_sheet(
     """Tiles in reading order on one sheet, each letterboxed into the same size with its caption below.
 
     Images are reduced by area averaging and enlarged by repeating pixels, so that no detail is invented.
-    A caption that is too wide is shortened with an ellipsis. Sheets without captions spend no room on them.
+    A caption that is too wide, or has a line break, goes on below itself, and is shortened with an ellipsis beyond
+    `CAPTION_LINES`. Sheets without captions spend no room on them.
 
     Args:
         tiles: (image, caption) pairs; images as :func:`as_picture` takes them, ``None`` for a missing one.
@@ -79,16 +81,18 @@ def contact_sheet(
     columns = min(columns, len(tiles))
     rows = -(-len(tiles) // columns)
     font = _font(max(SMALLEST_FONT, min(18, width // 14)))
-    caption_height = _line_height(font) if any(caption for _, caption in tiles) else 0
+    captions = [_wrapped(caption, font, width) for _, caption in tiles]
+    caption_height = _line_height(font) * max(map(len, captions))
     pitch_x, pitch_y = width + GAP, height + caption_height + GAP
 
     sheet = Image.new("RGB", (columns * pitch_x + GAP, rows * pitch_y + GAP), SHEET_BACKGROUND)
     draw = ImageDraw.Draw(sheet)
-    for index, (image, caption) in enumerate(tiles):
+    for index, ((image, _), lines) in enumerate(zip(tiles, captions, strict=True)):
         left, top = GAP + index % columns * pitch_x, GAP + index // columns * pitch_y
         sheet.paste(_tile(image, width, height), (left, top))
-        text = _shortened(caption, font, width)
-        draw.text((left + width / 2, top + height), text, CAPTION_COLOR, font, anchor="ma")
+        for line, text in enumerate(lines):
+            middle = left + width / 2, top + height + line * _line_height(font)
+            draw.text(middle, text, CAPTION_COLOR, font, anchor="ma")
     return np.array(sheet)
 
 
@@ -272,9 +276,21 @@ def _line_height(font: ImageFont.FreeTypeFont) -> int:
     return sum(font.getmetrics()) + 2
 
 
-def _shortened(text: str, font: ImageFont.FreeTypeFont, width: int) -> str:
-    """The text on one line, cut with an ellipsis where it would be wider than ``width`` pixels."""
-    line = " ".join(text.split())
+def _wrapped(text: str, font: ImageFont.FreeTypeFont, width: int) -> list[str]:
+    """The text's lines, at most `CAPTION_LINES`, each shortened where it would be wider than ``width`` pixels."""
+    lines: list[str] = []
+    for part in text.splitlines():
+        for index, word in enumerate(part.split()):
+            longer = f"{lines[-1]} {word}" if lines else word
+            if lines and (len(lines) == CAPTION_LINES or (index and font.getlength(longer) <= width)):
+                lines[-1] = longer
+            else:
+                lines.append(word)
+    return [_shortened(line, font, width) for line in lines]
+
+
+def _shortened(line: str, font: ImageFont.FreeTypeFont, width: int) -> str:
+    """The line, cut with an ellipsis where it would be wider than ``width`` pixels."""
     if font.getlength(line) <= width:
         return line
     while line and font.getlength(line + "…") > width:

@@ -72,6 +72,14 @@ def test_keypoints_that_a_used_view_does_not_contribute_are_counted_and_do_not_c
     assert studio.keypoints_left_out("p0", "left") == ("chin",)
 
 
+def test_a_keypoint_that_is_used_though_it_is_far_off_is_explained(tmp_path, eventful):
+    assert "measured against what remains" not in str(blocks(eventful, "text"))
+    studio = made.with_verdict(made.made_up(), "p0", "middle", made.verdict("agrees", "", 0.0343))
+    content = twin(studio, tmp_path)
+    assert figure(content, "Worst keypoint used of a view") == pytest.approx(3.43)
+    assert "which is why one that is used may be further off" in str(blocks(content, "text"))
+
+
 def test_every_view_left_out_is_listed_with_its_reason(eventful):
     listed = {
         (row["person"], row["camera"]): row["reason"] for row in rows(eventful, "person", "camera", "reason")
@@ -86,7 +94,7 @@ def test_every_view_left_out_is_listed_with_its_reason(eventful):
 
 def test_people_left_out_are_listed_with_their_reason_and_do_not_enter_the_spread(eventful):
     assert rows(eventful, "person", "reason") == [{"person": "p3", "reason": "only 1 view shows the face"}]
-    assert figure(eventful, "Spread of keypoints before") < 10
+    assert figure(eventful, "Spread of keypoints before, RMS") < 10
 
 
 def test_a_missing_keypoint_is_missing_in_the_figures_of_its_person_only(eventful):

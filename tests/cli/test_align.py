@@ -379,6 +379,13 @@ def test_what_cannot_work_ends_with_1_and_says_why(capture, capsys, spoil, words
     assert not (capture.parent / "alignment" / "alignment.json").exists()
 
 
+def test_landmarks_that_are_not_there_leave_no_folder(capture, tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    assert align(capture, "--landmarks", tmp_path / "empty") == 1
+    assert capsys.readouterr().err.startswith(f"{tmp_path / 'empty'}: ")
+    assert not (capture.parent / "alignment").exists()
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -395,7 +402,10 @@ def test_what_cannot_work_ends_with_1_and_says_why(capture, capsys, spoil, words
 )
 def test_wrong_usage_ends_with_2(arguments, capsys):
     assert run(*arguments) == 2
-    assert "usage:" in capsys.readouterr().err
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("preface-align")
+    assert ": error: " in line
+    assert line.endswith(" --help")
 
 
 def test_help_comes_at_once():

@@ -143,6 +143,14 @@ def test_what_cannot_work_says_why(folder, capsys, flags, status, words):
     assert not (folder.parent / "alignment" / "alignment.json").exists()
 
 
+def test_landmarks_that_are_not_there_leave_no_folder(folder, tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    output = tmp_path / "new" / "alignment"
+    assert align(folder, "--landmarks", tmp_path / "empty", "--output", output) == 1
+    assert capsys.readouterr().err.startswith(f"{tmp_path / 'empty'}: ")
+    assert not output.parent.exists()
+
+
 def test_an_empty_folder_is_told(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     assert align(tmp_path / "empty") == 1

@@ -281,6 +281,20 @@ def test_what_is_wrong_with_the_input_ends_with_1_and_one_line(
     assert not (tmp_path / "rig.json").exists()
 
 
+@pytest.mark.parametrize("flag", ["--output", "--report"])
+def test_an_output_that_cannot_be_written_is_told_before_boards_are_searched_for(
+    capture, tmp_path, capsys, monkeypatch, flag
+):
+    monkeypatch.setattr("preface.cli.calibrate_board.detect_corners", None)
+    (tmp_path / "file").write_text("mine")
+    place = tmp_path / "file" / ("rig.json" if flag == "--output" else "rig.html")
+    where = ["--output", tmp_path / "new" / "rig.json", flag, place]
+    assert run("board", capture, *BOARD, "--take", "monday", *where) == 1
+    told = f"{tmp_path / 'file'}: writing: not a directory. Correct the path: one of its folders is a file.\n"
+    assert capsys.readouterr().err == told
+    assert not (tmp_path / "new").exists()
+
+
 def test_too_few_frames_name_the_capture_and_the_camera(capture, tmp_path, observations, capsys):
     few = write_corners(tmp_path / "few.json", Corners("monday", observations.of_frames([0, 1])))
     given = ["--corners", few, "--take", "monday", "--output", tmp_path / "rig.json", *PLAIN]
@@ -324,6 +338,19 @@ def test_an_imported_rig_may_be_of_arbitrary_scale(tmp_path):
         back = tmp_path / f"{scale}.json"
         assert run("import", source, *words, "--output", back) == 0
         assert read_rig(back).scale == scale
+
+
+def test_a_folder_of_several_rigs_is_not_exported_but_its_rigs_are_named(tmp_path, capsys):
+    for take in ("monday", "tuesday"):
+        path = tmp_path / "rigs" / f"{take}.json"
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes((SCHEMA_DIRECTORY / "rig.example.json").read_bytes())
+    target = tmp_path / "transforms.json"
+    assert run("export", tmp_path, "--format", "nerfstudio", "--output", target) == 1
+    problem = capsys.readouterr().err
+    assert "holds several rigs: rigs/monday.json, rigs/tuesday.json" in problem
+    assert f"Name one, such as {tmp_path / 'rigs' / 'monday.json'}" in problem
+    assert not target.exists()
 
 
 def test_a_file_of_no_known_format_says_what_was_tried(tmp_path, capsys):

@@ -65,6 +65,16 @@ def test_heads_side_by_side_leave_figures_tables_pictures_and_a_page(models, sha
     assert not report.problems
     assert report.summary["views"] == ["camera4", "camera5"]
     assert report.summary["kind"] == "head"
+    # The folder itself stands for all of them.
+    assert [one.path.parent.name for one in inspect(out)] == ["out", *names]
+
+
+def test_a_folder_that_holds_other_things_is_left_alone(models, shards, tmp_path, capsys):
+    (tmp_path / "holiday.jpg").write_bytes(b"mine")
+    arguments = ["--shards", str(shards), "--output", str(tmp_path), "--lpips", "none"]
+    assert main([str(models / "with" / "head"), *arguments]) == 1
+    assert "holds other things than an evaluation (holiday.jpg)" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["holiday.jpg"]
 
 
 def test_normals_are_left_out_when_they_are_not_wanted_and_no_figure_changes(models, shards, tmp_path):
@@ -117,7 +127,7 @@ def test_the_same_command_writes_the_same_bytes(models, shards, tmp_path, monkey
         (["with/head"], ["--identity", "id0001"], 1, "Perhaps 'id0000' was meant"),
         (["with/head"], ["--views", "camera4", "camera6"], 1, "has no view 'camera6'"),
         (["with/head"], ["--views"], 2, "expected at least one argument"),
-        (["with/head"], ["--face-half-side", "-1"], 2, "0.001 to 10 metres"),
+        (["with/head"], ["--face-half-side", "-1"], 2, "0.001 to 10"),
         (["with/head"], ["--device", "cuda:77"], 2, "--device"),
         (["with/head"], ["--lpips", "squeeze"], 2, "squeeze"),
         (["with/head", "with/head"], [], 1, "given twice"),

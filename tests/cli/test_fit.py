@@ -65,14 +65,15 @@ def test_wrong_usage_ends_with_status_two(balls, tmp_path, capsys):
     assert status_of([]) == 2
     assert status_of([balls, "--quality", "best"]) == 2
     assert status_of([balls, "--prior", "none", "--output", tmp_path / "h"]) == 2  # no views
-    assert "--views: 0 cameras" in capsys.readouterr().err
+    assert "preface-fit: error: --views: 0 cameras" in capsys.readouterr().err
     assert status_of([balls, "--photos.resolution", "8x8", "--views", "camera0"]) == 2
     assert "is for a folder of photographs" in capsys.readouterr().err
 
 
 def test_a_folder_of_neither_kind_is_refused(tmp_path, capsys):
     assert status_of([tmp_path]) == 1
-    assert "holds neither shards (manifest.json) nor photographs" in capsys.readouterr().err
+    told = f"{tmp_path}: folder: holds neither shards (manifest.json) nor photographs"
+    assert capsys.readouterr().err.startswith(told)
     assert status_of([tmp_path / "gone", "--views", "a", "--prior", "none"]) == 1
     (tmp_path / "subjects").mkdir()
     assert status_of([tmp_path]) == 1
@@ -112,3 +113,18 @@ def test_a_command_fits_what_it_was_told():
     assert type(config) is not FitCommand
     assert (config.shards, config.identity, config.views) == (Path("s"), "anna", ("a", "b"))
     assert (config.seed, config.refine_cameras) == (3, True)
+
+
+def test_a_folder_that_holds_other_things_is_left_alone(balls, tmp_path, capsys):
+    (tmp_path / "capture.json").write_text("{}")
+    assert status_of([balls, "--prior", "none", "--views", "camera0", "--output", tmp_path]) == 1
+    assert "holds other things than a head (capture.json)" in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["capture.json"]
+
+
+def test_an_interrupted_preparation_of_photographs_is_gone_on_with(tmp_path, capsys):
+    (tmp_path / "head" / "photos" / "alignment").mkdir(parents=True)
+    (tmp_path / "head" / "photos" / "template.json").write_text("{}")
+    (tmp_path / "none").mkdir()
+    assert status_of([tmp_path / "none", "--output", tmp_path / "head"]) == 1
+    assert "holds neither shards" in capsys.readouterr().err  # it is about the photographs, not the output

@@ -14,6 +14,7 @@ from preface.align.keypoints import FACEMESH478
 from preface.align.landmark_files import landmark_file, write_landmarks
 from preface.align.landmarks import ViewLandmarks, box_around
 from preface.align.photos.face import face_prior, keypoint_weights
+from preface.align.photos.views import HARDLY
 from preface.artifacts import ArtifactError, load_json, provenance
 from preface.capture.images import write_png
 from preface.capture.rig import write_rig
@@ -125,10 +126,10 @@ def test_one_to_seven_photographs_are_taken(tmp_path):
     ("photo", "quality", "asked", "expected"),
     [
         ((135, 240), "balanced", "auto", (24, 36)),
-        ((135, 240), "reference", "auto", (5 * 24, 5 * 36)),
-        ((1000, 750), "reference", "auto", (8 * 24, 8 * 36)),
-        ((12, 160), "reference", "auto", (12, 18)),
-        ((135, 240), "reference", "50x60", (50, 60)),
+        ((135, 240), "paper", "auto", (5 * 24, 5 * 36)),
+        ((1000, 750), "paper", "auto", (8 * 24, 8 * 36)),
+        ((12, 160), "paper", "auto", (12, 18)),
+        ((135, 240), "paper", "50x60", (50, 60)),
     ],
 )
 def test_views_have_the_size_that_suits_the_prior_and_the_photographs(
@@ -215,11 +216,11 @@ def test_trust_tells_what_is_settled_from_what_is_expected(ball, tmp_path):
     rows = [
         {"what": "focal length", "value": 1000.0, "±": 200.0, "unit": "px", "rests on": "expectation"},
         {"what": "distance of a", "value": 500.0, "±": 10.0, "unit": "mm", "rests on": "photographs"},
-        {"what": "distance of b", "value": 500.0, "±": 100.0, "unit": "mm", "rests on": "photographs"},
+        {"what": "distance of b", "value": 500.0, "±": 100.0, "unit": "mm", "rests on": HARDLY},
         {"what": "chin", "value": None, "±": 2.0, "unit": "mm", "rests on": "photographs"},
         {"keypoint": "chin", "from the photographs": 60.0},
     ]
-    found = trust(alignment_report(tmp_path, rows), ball, from_prior=False)
+    found = trust(alignment_report(tmp_path, rows), ball, tmp_path / "views.png", from_prior=False)
     assert found.numbers == (
         "Settled by the photographs: distance of a 500 ± 10 mm; chin to 2.0 mm.",
         "From what is usual of faces and of phones: focal length 1000 ± 200 px.",
@@ -237,7 +238,20 @@ def test_a_damaged_report_is_named(ball, tmp_path):
     folder = alignment_report(tmp_path, [])
     (folder / "report.json").write_text('{"sections": 3}')
     with pytest.raises(ArtifactError, match="is not a report"):
-        trust(folder, ball, from_prior=True)
+        trust(folder, ball, tmp_path / "views.png", from_prior=True)
+
+
+def test_trust_is_a_page_with_the_head_the_views_and_links_to_what_it_sums_up(ball, tmp_path):
+    write_png(tmp_path / "views.png", np.full((20, 60, 3), 90, np.uint8))
+    found = trust(alignment_report(tmp_path, []), ball, tmp_path / "views.png", from_prior=True)
+    assert [name for _, name in found.thumbnails] == [f"camera{view}" for view in range(6)]
+    twin = load_json(found.report({}, tmp_path).write(tmp_path / "trust.html").with_suffix(".json"))
+    blocks = [block for section in twin["sections"] for block in section["blocks"]]
+    pictures = [block for block in blocks if block["kind"] == "picture"]
+    assert (pictures[0]["width"], pictures[0]["height"]) == (60, 20)
+    assert "24x32 pixels" in pictures[1]["caption"]
+    links = [link["path"] for block in blocks if block["kind"] == "links" for link in block["links"]]
+    assert links == ["alignment/report.html", "balls/masks.html"]
 
 
 @pytest.fixture

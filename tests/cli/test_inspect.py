@@ -91,19 +91,27 @@ def test_a_folder_with_a_rig_and_a_capture_shows_both(capture):
 
 
 def test_a_folder_without_artefacts_says_what_may_be_meant(tmp_path):
-    empty, rigs, evaluation = (tmp_path / name for name in ("empty", "rigs", "evaluation"))
-    for file in (rigs / "monday.json", evaluation / "report.json", evaluation / "head" / "metrics.json"):
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.touch()
-    empty.mkdir()
-    told = run(empty, rigs, evaluation)
+    empty, rigs = tmp_path / "empty", tmp_path / "rigs"
+    for folder in (empty, rigs):
+        folder.mkdir()
+    (rigs / "monday.json").touch()
+    told = run(empty, rigs, tmp_path)
     assert told.returncode == 1
     first, second, third = told.stderr.splitlines()
     assert first.endswith(
-        "metrics.json, nor a folder subjects. Name an artefact or the folder that holds it."
+        "nor a folder subjects, and neither do its folders. Name an artefact or the folder that holds it."
     )
     assert second.endswith(f", such as {rigs / 'monday.json'}.")
-    assert third.endswith(f", such as {evaluation / 'head'}.")
+    assert third.endswith(f", such as {rigs / 'monday.json'}.")
+
+
+def test_a_folder_of_the_rigs_of_several_takes_and_the_one_above_stand_for_them(tmp_path):
+    for take in ("monday", "tuesday"):
+        example("rig", tmp_path / "rigs" / f"{take}.json")
+    for folder in (tmp_path, tmp_path / "rigs"):
+        result = run(folder)
+        assert result.returncode == 0
+        assert result.stdout.count("preface/rig: valid") == 2
 
 
 def test_every_problem_is_told_not_only_the_first(capture):
@@ -147,7 +155,9 @@ def test_wrong_usage_ends_with_2(arguments):
     result = run(*arguments)
     assert result.returncode == 2
     assert result.stdout == ""
-    assert "usage: preface-inspect" in result.stderr
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("preface-inspect: error: ")
+    assert line.endswith("; see preface-inspect --help")
 
 
 def test_help_is_quick_and_imports_nothing_heavy():
@@ -196,3 +206,43 @@ def test_names_outside_the_terminals_encoding_are_escaped(tmp_path):
     )
     assert result.returncode == 1
     assert "B\\xfcro\\x1b[31m.json: file: no such file" in result.stderr
+
+
+# ------------------------------------------------------------------- folders that hold no artefact's own name
+
+
+def example(name, target):
+    """The worked example of a schema, as a file."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(SCHEMA_DIRECTORY / f"{name}.example.json", target)
+
+
+def test_the_folder_of_an_evaluation_stands_for_its_report_and_the_figures_of_each_head(tmp_path):
+    example("report", tmp_path / "report.json")
+    example("metrics", tmp_path / "head" / "metrics.json")
+    example("metrics", tmp_path / "alone" / "metrics.json")
+    (tmp_path / "other.json").write_text("not JSON")
+    result = run(tmp_path, "--json")
+    found = {(a["path"], a["schema"]) for a in json.loads(result.stdout)["artifacts"]}
+    assert result.returncode == 0
+    assert found == {
+        (str(tmp_path / "report.json"), "preface/report"),
+        (str(tmp_path / "head" / "metrics.json"), "preface/metrics"),
+        (str(tmp_path / "alone" / "metrics.json"), "preface/metrics"),
+    }
+
+
+def test_the_photographs_of_a_head_stand_for_their_alignment_though_a_template_lies_beside_it(tmp_path):
+    example("template", tmp_path / "template.json")
+    example("rig", tmp_path / "alignment" / "rig.json")
+    result = run(tmp_path)
+    assert result.returncode == 0
+    assert "template.json: preface/template: valid" in result.stdout
+    assert "alignment/rig.json: preface/rig: valid" in result.stdout
+
+
+def test_a_folder_of_nothing_known_is_a_problem(tmp_path):
+    (tmp_path / "holiday.jpg").touch()
+    result = run(tmp_path)
+    assert result.returncode == 1
+    assert "holds none of capture.json" in result.stderr

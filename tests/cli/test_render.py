@@ -188,3 +188,36 @@ def test_a_folder_without_a_model_and_one_that_cannot_be_written_are_errors(prio
     (tmp_path / "file").touch()
     assert main([str(prior), "--identity", names(prior)[0], "--output", str(tmp_path / "file" / "out")]) == 1
     assert "file" in capsys.readouterr().err
+
+
+def test_photographs_and_the_rig_of_a_capture_are_left_alone(prior, tmp_path, capsys):
+    def render(folder):
+        return main([str(prior), "--identity", names(prior)[0], "--size", "8x12", "--output", str(folder)])
+
+    pictures, studio = tmp_path / "pictures", tmp_path / "studio"
+    for folder, file in ((pictures, "left.JPG"), (studio, "rig.json")):
+        folder.mkdir()
+        (folder / file).write_text('{"take": "monday"}')
+        assert render(folder) == 1
+        assert f"{folder}: folder: holds other things than renders ({file})" in capsys.readouterr().err
+        assert [entry.name for entry in folder.iterdir()] == [file]
+
+
+def test_a_folder_of_renders_is_rendered_into_again_also_after_an_interruption(prior, tmp_path):
+    arguments = [str(prior), "--identity", names(prior)[0], "--size", "8x12", "--output", str(tmp_path)]
+    assert main(arguments) == 0
+    assert main(arguments) == 0
+    (tmp_path / "rig.json").unlink()
+    assert main(arguments) == 0
+
+
+def test_an_unknown_identity_is_refused_and_a_text_is_no_prior(prior, tmp_path, capsys):
+    (tmp_path / "note.txt").write_text("hello")
+    assert main([str(tmp_path / "note.txt"), "--output", str(tmp_path / "out")]) == 1
+    told = capsys.readouterr().err
+    assert "note.txt: prior: is not a prior. Name the folder that preface-train wrote." in told
+    with pytest.raises(SystemExit, match="2"):
+        main([str(prior), "--output", str(tmp_path / "out"), "--size", "0x10"])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("preface-render: error: argument --size: '0x10' is not WIDTHxHEIGHT")
+    assert line.endswith("see preface-render --help")

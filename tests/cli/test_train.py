@@ -140,7 +140,7 @@ def test_the_path_of_the_prior_is_printed_last_and_resuming_changes_nothing(ball
 
 def test_shards_that_are_not_there_end_with_1(tmp_path, capsys):
     assert main([str(tmp_path / "none"), "--output", str(tmp_path / "a")]) == 1
-    assert "none" in capsys.readouterr().err
+    assert capsys.readouterr().err.startswith(f"{tmp_path / 'none'}: ")
 
 
 def test_a_prior_can_be_inspected(balls, tmp_path):
@@ -158,3 +158,45 @@ def test_a_prior_can_be_inspected(balls, tmp_path):
     (tmp_path / "a" / "model.safetensors").write_bytes(data)
     summarise_prior(tmp_path / "a" / "model.json", problems)
     assert "sha256" in str(problems[0])
+
+
+def test_a_folder_of_photographs_is_left_alone_and_an_interrupted_run_resumed(balls, tmp_path, capsys):
+    arguments = [str(balls), "--preset", "tiny", "--output", str(tmp_path), *SMALL]
+    (tmp_path / "holiday.jpg").write_bytes(b"mine")
+    assert main(arguments) == 1
+    assert "holds other things than a prior (holiday.jpg)" in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["holiday.jpg"]
+    arguments[arguments.index(str(tmp_path))] = str(balls)  # the shards' own folder
+    assert main(arguments) == 1
+    assert not (balls / "model.json").exists()
+
+
+def test_a_run_that_ended_before_its_first_checkpoint_goes_on(balls, tmp_path, monkeypatch):
+    from preface.model.training import prior
+
+    def stopped(*arguments):
+        raise KeyboardInterrupt
+
+    arguments = [str(balls), "--preset", "tiny", "--output", str(tmp_path / "a"), *SMALL]
+    with monkeypatch.context() as patched:
+        patched.setattr(prior, "take_steps", stopped)
+        assert main(arguments) == 130
+    assert (tmp_path / "a" / "log.jsonl").exists()
+    assert main(arguments) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "PATH"),
+        (["shards", "--stps", "3"], "--stps, 3; perhaps --steps was meant"),
+        (["shards", "--preset", "huge"], "'huge'"),
+        (["shards", "--steps", "many"], "--steps: invalid"),
+    ],
+)
+def test_wrong_usage_is_one_line(arguments, words, capsys):
+    assert status_of_exit(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("preface-train: error: ")
+    assert words in line
+    assert line.endswith("; see preface-train --help")

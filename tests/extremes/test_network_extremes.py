@@ -246,7 +246,7 @@ def test_numbers_of_rays(count: int, matmul: str) -> None:
 def test_rays_that_all_miss_the_box(normals: bool, matmul: str) -> None:
     model = model_of(predicted_normals=normals, matmul=matmul)
     rays = dataclasses.replace(some_rays(4), hit=torch.zeros(4, 1, dtype=torch.bool))
-    rendered = model(rays, model.codes, background=1.0)
+    rendered = model(rays, model.codes, background=1.0, normals=normals)
     assert (rendered.rgb == 1).all()
     assert (rendered.acc == 0).all()
     assert rendered.share == 0
@@ -293,7 +293,7 @@ def test_normals_of_any_density_have_finite_second_derivatives(raw: float, flat:
     model.nerf.density.bias.data.fill_(raw)
     if flat:
         model.nerf.density.weight.data.zero_()
-    rendered = model(rays, model.codes)
+    rendered = model(rays, model.codes, normals=True)
     require_sound(model, rendered, loss_of(rendered))
     length = rendered.normals.norm(dim=-1)
     assert (length <= 1 + 1e-5).all()

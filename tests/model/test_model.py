@@ -108,12 +108,25 @@ def test_normals_reach_the_density_as_in_the_concatenated_form() -> None:
 
     expected = concatenated_model.render(model, rays, codes)
     slow = gradients(model, loss(expected["levels"][-1][1], expected["normals"], expected["normals_pred"]))
-    rendered = model(rays, model.codes)
+    rendered = model(rays, model.codes, normals=True)
     fast = gradients(model, loss(rendered.levels[-1].weights, rendered.normals, rendered.normals_pred))
     assert "nerf.normals.weight" in fast
     assert float(fast["nerf.layers.0.weight"].norm()) > 0
     for name, gradient in slow.items():
         assert float((fast[name] - gradient).norm()) < 1e-4 * float(gradient.norm()) + 1e-9, name
+
+
+def test_a_layer_that_predicts_normals_costs_nothing_until_they_are_asked_for(monkeypatch) -> None:
+    model, rays = model_of(dataclasses.replace(SMALL, predicted_normals=True)), some_rays(8)
+    shown = model(rays, model.codes, normals=True)
+
+    def refused(*_, **__):
+        raise AssertionError("a derivative was taken")
+
+    monkeypatch.setattr(torch.autograd, "grad", refused)
+    plain = model(rays, model.codes)
+    assert (plain.normals, plain.normals_pred) == (None, None)
+    torch.testing.assert_close(plain.rgb, shown.rgb, rtol=0, atol=1e-6)
 
 
 def test_groups_may_be_said_in_any_order() -> None:
@@ -128,7 +141,7 @@ def test_groups_may_be_said_in_any_order() -> None:
 def test_a_folded_code_renders_the_same_without_a_code() -> None:
     model, rays = model_of(dataclasses.replace(SMALL, predicted_normals=True)), some_rays(9)
     folded = fold(model, model.codes[2].detach())
-    ours, theirs = folded(rays), model(rays, model.codes[2:3])
+    ours, theirs = folded(rays, normals=True), model(rays, model.codes[2:3], normals=True)
     assert float((ours.rgb - theirs.rgb).detach().abs().max()) < 1e-6
     assert float((ours.normals_pred - theirs.normals_pred).detach().abs().max()) < 1e-5
     folded.nerf.layers[0].weight.data.zero_()

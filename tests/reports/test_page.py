@@ -231,6 +231,13 @@ def test_provenance_is_flattened_on_the_page_and_kept_in_the_twin(tmp_path):
     assert twin["provenance"] == {"seed": 7, "versions": {"torch": "2.13.0"}, "config": {"sizes": [1, 2]}}
 
 
+def test_the_page_leaves_out_provenance_that_there_is_none_of_and_the_twin_keeps_it(tmp_path):
+    history = {"config": {}, "seed": None, "inputs": {"given": None}}
+    page, twin = written(Report("Empty", history), tmp_path)
+    assert page.texts("dt") == ["inputs.given"]
+    assert twin["provenance"] == history
+
+
 def test_the_worked_example_of_the_schema_is_a_valid_report():
     specs = Path(__file__).parents[2] / "data_specs"
     example = read_artifact(specs / "report.example.json", "preface/report")

@@ -120,6 +120,15 @@ def test_a_long_caption_stays_inside_its_tile():
     assert columns.max() < tile_left + 80
 
 
+def test_a_caption_that_is_too_wide_for_one_line_goes_on_below():
+    def rows_of_ink(caption):
+        sheet = contact_sheet([(plain(RED, 60, 90), caption)], 1, (90, 60))
+        ink = np.abs(sheet[box_of(sheet, RED)[3] :].astype(int) - np.array(SHEET_BACKGROUND)).sum(-1) > 100
+        return ink.any(1).sum()
+
+    assert rows_of_ink("id0002 cam01 11.6 % disagrees") > 1.5 * rows_of_ink("id0002 cam01")
+
+
 def test_a_missing_image_leaves_a_marked_place():
     sheet = contact_sheet([(None, ""), (plain(RED, 30, 30), "")], columns=2, tile_size=(30, 30))
     left = sheet[:, : sheet.shape[1] // 2]

@@ -39,4 +39,4 @@ def test_what_is_not_there_is_named_and_ends_with_one(tmp_path, capsys):
     assert str(tmp_path / "nobody" / "images") in capsys.readouterr().err
     (tmp_path / "file").write_text("mine")
     assert real_faces.main(["walk-around", *words[:2], str(tmp_path / "file" / "out")]) == 1
-    assert "real_faces: " in capsys.readouterr().err
+    assert f"{tmp_path / 'file' / 'out'}: writing: " in capsys.readouterr().err

@@ -25,8 +25,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from training_step import CHUNK, SMALLEST_RADIUS, seconds, some_rays
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from bench.training_step import CHUNK, SMALLEST_RADIUS, seconds, some_rays
 from preface.model import coord, losses
 from preface.model.configuration import PRESETS, ModelConfig, preset
 from preface.model.matmul import choose_route, denormals_flushed, keep_freed_memory

@@ -127,7 +127,7 @@ STAGES = (
         "Fit",
         "fit",
         f"`--quality {FitConfig.quality}`",
-        "It takes minutes on two cores; `draft` is to look at, and `reference` has the paper's numbers, for a GPU.",
+        "It takes minutes; `draft` is to look at, `reference` for who can wait, `paper` for a GPU.",
         fit,
     ),
     Stage(

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from preface.capture.finding import MARKER_PIXELS
 from preface.geometry.transforms import Rigid
-from synthetic_studio.config import BoardConfig
+from synthetic_studio.config import BoardConfig, StudioConfig
 from synthetic_studio.patterns import BoardPattern
-from synthetic_studio.rig import HEAD_CENTRE, StudioCamera
+from synthetic_studio.rig import DISTANCE, HEAD_CENTRE, StudioCamera, nominal_rig
 from synthetic_studio.streams import Stream, generator
 
 # The board's middle stays within this box (half sides, metres) about the head's: partly out of some frames.
@@ -37,6 +39,26 @@ def board_pose(config: BoardConfig, pattern: BoardPattern, seed: int, take: int,
     rotation = (tilted * rolled).as_matrix() @ RIG_FROM_FACING_BOARD
     middle = HEAD_CENTRE + random.uniform(-REACH, REACH)
     return Rigid(rotation, middle - rotation @ np.append(pattern.extent / 2, 0))
+
+
+def markers_in_words(config: StudioConfig) -> list[str]:
+    """How large the board's markers are in the images, and what to do if they are too small to calibrate from.
+
+    Nothing for a chessboard, which has none.
+    """
+    pattern = BoardPattern.from_config(config.board)
+    if not pattern.marker:
+        return []
+    focal = nominal_rig(1, config.size, config.seed)[0].camera.intrinsics[0]
+    pixels = focal * pattern.marker / DISTANCE
+    lines = [f"markers             {pixels:>10.1f} pixels along the side of each, seen head-on"]
+    if pixels < MARKER_PIXELS:
+        width, height = (math.ceil(side * MARKER_PIXELS / pixels) for side in config.size)
+        lines.append(
+            f"The cameras can hardly be calibrated: boards are found from {MARKER_PIXELS} pixels per marker on. Choose "
+            f"a --resolution from {width}x{height} on, or fewer --board.squares with a larger --board.square-mm."
+        )
+    return lines
 
 
 @dataclass(frozen=True)

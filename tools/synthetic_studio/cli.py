@@ -3,38 +3,42 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Sequence
 
 import tyro
 
-from preface.artifacts import ArtifactError
+from preface.cli.output import exit_status, resumable, say
+from preface.cli.typed_flags import refusing, told_in_a_line
+from preface.plain_words import counted, disk_space
 from synthetic_studio.assets import check_assets
-from synthetic_studio.config import StudioConfig, StudioError, UsageError, validate
+from synthetic_studio.boards import markers_in_words
+from synthetic_studio.config import StudioConfig, StudioError, validate
 from synthetic_studio.estimate import estimate
 from synthetic_studio.writer import write_studio
 
-INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+PROGRAM = "synthetic_studio"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the studio; returns the exit status: 0, 2 for wrong usage, 130 if interrupted, 1 otherwise."""
-    config = tyro.cli(StudioConfig, prog="synthetic_studio", args=arguments)
-    try:
-        if config.dry_run:
-            validate(config)
-            if config.assets is not None:
-                check_assets(config.assets)
-            print(describe(config))
-        else:
-            print(write_studio(config))
-    except UsageError as error:
-        return _complain(str(error), 2)
-    except (StudioError, ArtifactError, OSError) as error:
-        return _complain(str(error), 1)
-    except KeyboardInterrupt:
-        return _complain("interrupted; run the same command again to resume", INTERRUPTED)
-    return 0
+    with told_in_a_line(PROGRAM):
+        config = tyro.cli(StudioConfig, prog=PROGRAM, args=arguments)
+    reasons = (StudioError, OSError)
+    return resumable(
+        lambda: exit_status(lambda: _run(config), refusing(PROGRAM), config.output, lambda: reasons)
+    )
+
+
+def _run(config: StudioConfig) -> list[str]:
+    """Write the studio, or say what that would take; returns the lines to print."""
+    validate(config)
+    if not config.dry_run:
+        for line in markers_in_words(config):
+            say(" ".join(line.split()))
+        return [str(write_studio(config))]
+    if config.assets is not None:
+        check_assets(config.assets)
+    return [describe(config)]
 
 
 def describe(config: StudioConfig) -> str:
@@ -43,22 +47,20 @@ def describe(config: StudioConfig) -> str:
     folder = config.output.absolute()
     existing = next(parent for parent in (folder, *folder.parents) if parent.is_dir())
     free = shutil.disk_usage(existing).free
-    minutes = cost.seconds / config.workers / 60
+    minutes, workers = cost.seconds / config.workers / 60, counted(config.workers, "worker", "workers")
     lines = [
         f"photographs         {cost.photographs:>10,}",
         f"calibration images  {cost.calibration_images:>10,}",
         f"clean plates        {cost.plates:>10,}",
-        f"disk                {cost.bytes / 1e9:>10.2f} GB, truth included; {free / 1e9:.1f} GB are free",
-        f"time                {minutes:>10.1f} min on {config.workers} workers, by the studio's cost model",
+        f"disk                {disk_space(cost.bytes):>13}, truth included; {disk_space(free)} are free",
+        f"time                {minutes:>10.1f} min on {workers}, by the studio's cost model",
         f"output              {config.output} (nothing written)",
     ]
+    markers = markers_in_words(config)
+    lines[3:3] = markers[:1]
+    lines += markers[1:]
     if cost.bytes > free:
         lines.append(
             "The disk is too small: choose another --output, fewer --identities or a lower --resolution."
         )
     return "\n".join(lines)
-
-
-def _complain(message: str, status: int) -> int:
-    print(f"synthetic_studio: {message}", file=sys.stderr)
-    return status

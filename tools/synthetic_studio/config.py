@@ -9,11 +9,13 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from preface.cli import usage
+
 MAX_SIDE = 16384
 MAX_VIEWS = 999
 
 
-class UsageError(ValueError):
+class UsageError(usage.UsageError):
     """A flag whose value cannot work; the message names the flag, its value and the remedy."""
 
     def __init__(self, flag: str, value: object, problem: str, remedy: str) -> None:
@@ -98,7 +100,8 @@ class StudioConfig:
     """Number of cameras; the first one is frontal."""
 
     resolution: str = "256x384"
-    """WIDTHxHEIGHT of every image in pixels, up to 4096x6144 and beyond."""
+    """WIDTHxHEIGHT of every image in pixels, up to 4096x6144 and beyond; below some 165x248 the board's markers are
+    too small to calibrate from."""
 
     seed: int = 0
     """Everything random follows from this number."""
@@ -126,7 +129,7 @@ class StudioConfig:
     """Worker processes; 0 uses every core. The images do not depend on it."""
 
     dry_run: bool = False
-    """State images, bytes, time and free disk, and write nothing."""
+    """State images, the size of markers, bytes, time and free disk, and write nothing."""
 
     @property
     def size(self) -> tuple[int, int]:

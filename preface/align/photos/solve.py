@@ -171,7 +171,7 @@ def _believed(
     if abs(np.log(focal) - found) > DISBELIEF * np.hypot(deviation, options.exif_deviation):
         warnings.append(
             f"EXIF's focal length of {focal:.2f} longer sides of the image contradicts the photographs, which "
-            f"say {np.exp(found):.2f} +- {deviation:.0%}: it was ignored"
+            f"say {np.exp(found):.2f} ± {deviation:.0%}: it was ignored"
         )
         return expected, "expectation", warnings
     return LensPrior(float(np.log(focal)), options.exif_deviation), "exif", warnings

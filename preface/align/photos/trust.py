@@ -5,10 +5,11 @@ import numpy as np
 from preface.align.keypoints import CANONICAL_KEYPOINTS
 from preface.align.photos.projection import LENS, POSE
 from preface.align.photos.solve import Solution
-from preface.align.photos.views import PhotoOptions, PhotoView, Source, Trust
+from preface.align.photos.views import HARDLY, PhotoOptions, PhotoView, Source, Trust, rests_on
 
 # The photographs determine a value when they reduce its expected variance by this share.
 DETERMINED = 0.75
+SCALE = "distance between the outer eye corners"
 NAMES = {
     "right_eye_outer": "outer corner of the right eye",
     "left_eye_outer": "outer corner of the left eye",
@@ -18,6 +19,7 @@ NAMES = {
 }
 WORDS = {
     "photographs": "the photographs determine it",
+    HARDLY: "it rests on the photographs, which hardly determine it",
     "exif": "it is EXIF's, adjusted",
     "expectation": "the photographs hardly determine it; it is what is usual for phones, adjusted",
 }
@@ -30,11 +32,12 @@ def lens_trust(solution: Solution, views: list[PhotoView]) -> list[Trust]:
     expected = solution.lens.log_focal_deviation
     source: Source = "photographs" if relative**2 < (1 - DETERMINED) * expected**2 else solution.focal_source
     focal = views[0].longer_side * float(np.exp(scene.log_focal))
-    text = f"The focal length is {focal:.0f} px +- {relative:.0%}: {WORDS[source]}."
+    words = WORDS[rests_on(source, focal, relative * focal)]
+    text = f"The focal length is {focal:.0f} px ± {relative:.0%}: {words}."
     found = [Trust("focal length", focal, relative * focal, "px", source, text)]
     if solution.lens.distortion_deviation:
         deviation = float(np.sqrt(covariance[1, 1]))
-        text = f"The lens has radial distortion, k = {scene.distortion:.3f} +- {deviation:.3f}."
+        text = f"The lens has radial distortion, k = {scene.distortion:.3f} ± {deviation:.3f}."
         found.append(Trust("distortion", scene.distortion, deviation, "", "photographs", text))
     else:
         text = "No distortion is modelled: the photographs do not determine one that differs from none."
@@ -51,7 +54,7 @@ def distance_trust(solution: Solution, views: list[PhotoView], depths: np.ndarra
         gradient = np.zeros(len(covariance))
         gradient[0], gradient[size] = 1.0, -1.0
         relative = float(np.sqrt(gradient @ covariance @ gradient))
-        text = f"'{view.id}' was taken from {depths[index]:.2f} m +- {relative:.0%}"
+        text = f"'{view.id}' was taken from {depths[index]:.2f} m ± {relative:.0%}"
         text += ", as far as the focal length is known." if relative > 0.05 else "."
         value = 1e3 * float(depths[index])
         found.append(Trust(f"distance of {view.id}", value, relative * value, "mm", "photographs", text))
@@ -64,8 +67,8 @@ def scale_trust(options: PhotoOptions, eyes: float, deviation: float, source: So
         "expectation": "nothing but the size of faces sets the scale",
         "given": "by the known distance" if options.known_distance else "the given cameras are metric",
     }[source]
-    text = f"The outer eye corners are {1e3 * eyes:.1f} +- {1e3 * deviation:.1f} mm apart: {why}."
-    return Trust("scale", 1e3 * eyes, 1e3 * deviation, "mm", source, text)
+    text = f"The outer eye corners are {1e3 * eyes:.1f} ± {1e3 * deviation:.1f} mm apart: {why}."
+    return Trust(SCALE, 1e3 * eyes, 1e3 * deviation, "mm", source, text)
 
 
 def keypoint_trust(

@@ -14,6 +14,9 @@ from preface.align.photos.noise import Observations
 from preface.capture.rig import Rig
 
 Source = Literal["photographs", "exif", "expectation", "given", "assumption"]
+HARDLY = "hardly the photographs"
+# A deviation of more than this share of its number is no settled number, whatever it rests on.
+LOOSE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +67,14 @@ class PhotoOptions:
     bias: LandmarkBias | None = None
 
 
+def rests_on(source: Source, value: float | None, deviation: float | None) -> str:
+    """What a number rests on, as every page has it: the source, or `HARDLY` where it is the photographs and these
+    leave the number loose.
+    """
+    loose = value is not None and deviation is not None and deviation > LOOSE * abs(value)
+    return HARDLY if source == "photographs" and loose else source
+
+
 @dataclass(frozen=True)
 class Trust:
     """How far one choice is trusted.
@@ -82,6 +93,11 @@ class Trust:
     unit: str
     source: Source
     text: str
+
+    @property
+    def rests_on(self) -> str:
+        """See `rests_on`."""
+        return rests_on(self.source, self.value, self.deviation)
 
 
 @dataclass(frozen=True, eq=False)

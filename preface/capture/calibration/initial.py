@@ -212,8 +212,8 @@ def require_views(views: BoardViews, homographies: np.ndarray, camera_ids: tuple
         of_camera = views.camera == camera
         if not of_camera.any():
             raise CalibrationError(
-                f"camera '{name}': it sees the board in no frame; check its images and the board's "
-                "description, or leave the camera out"
+                f"camera '{name}': it sees the board in no frame; check its images, which may be too small for the "
+                "board's markers, and the board's description, or leave the camera out"
             )
         outlines = corners @ np.swapaxes(homographies[of_camera], -1, -2)
         different = _different((outlines[..., :2] / outlines[..., 2:]).reshape(len(outlines), -1))

@@ -5,7 +5,7 @@ black background, a clean plate, MediaPipe's selfie segmentation, a user's ONNX 
 `choose` picks one for a take and says why; `hull_disagreement` finds masks that contradict those of the other
 views; `mask_report` shows edges over photographs, worst first.
 
-    choice = choose(capture, "take01")                     # Choice("green", "take take01 says that ...", ...)
+    choice = choose(capture, "take01")                     # Choice("green", "take01 says that ...", ...)
     segmenter = choice.segmenter()                         # one per process
     found = segmenter(read_image(path), hints_of(capture, "take01", "id0032", "cam00"))
     found.alpha, found.pixels                              # float32 [h, w]; as read, without the screen's light

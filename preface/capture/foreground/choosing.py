@@ -132,7 +132,7 @@ def _automatic(
     cameras = {camera for _, camera in views}
     plated = sum((take.id, camera) in capture.plates for camera in cameras)
     if take.background in ("black", "green"):
-        reason = f"{before}take {take.id} says that its background is {take.background}"
+        reason = f"{before}{take.id} says that its background is {take.background}"
         return Choice(take.background, reason, take.background, some)
     if cameras and plated == len(cameras):
         reason = f"{before}there are clean plates of all {plated} cameras"

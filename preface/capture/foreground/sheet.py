@@ -66,19 +66,20 @@ class MaskFigures:
 
 
 def worst_first(figures: Sequence[MaskFigures]) -> list[MaskFigures]:
-    """All masks: flagged ones, then those with notes, then by how unusual they are.
+    """All masks: flagged ones, then those with notes, each by how far they are off the hull.
 
-    Unusual is a mask that disagrees with the hull, covers much more or less of the image than the camera's
-    others, or has a soft edge that is wide.
+    Those of which that is unknown come last, the unusual first: a mask that covers much more or less of the image
+    than the camera's others, or has a soft edge that is wide.
     """
     by_camera = defaultdict(list)
     for one in figures:
         by_camera[one.camera].append(one.share)
     usual = {camera: float(np.median(shares)) for camera, shares in by_camera.items()}
 
-    def badness(one: MaskFigures) -> tuple[bool, bool, float]:
-        disagreement = 0.0 if np.isnan(one.disagreement) else one.disagreement
-        return one.flagged, bool(one.notes), disagreement + abs(one.share - usual[one.camera]) + one.soft
+    def badness(one: MaskFigures) -> tuple[bool, bool, float, float]:
+        disagreement = -1.0 if np.isnan(one.disagreement) else one.disagreement
+        unusual = abs(one.share - usual[one.camera]) + one.soft
+        return one.flagged, bool(one.notes), disagreement, unusual
 
     return sorted(figures, key=badness, reverse=True)
 
@@ -109,9 +110,9 @@ def mask_report(
         [
             KeyFigure("Masks", len(figures)),
             KeyFigure("Methods", methods),
-            KeyFigure("Contradict the other views", flagged),
-            KeyFigure("Disagreement with the hull, median", float(np.median(checked)) if checked else None),
-            KeyFigure("Foreground, median", float(np.median([one.share for one in figures]))),
+            KeyFigure("Flagged: contradict the other views", flagged),
+            KeyFigure("Off the hull, median", 100 * float(np.median(checked)) if checked else None, "%"),
+            KeyFigure("Foreground, median", 100 * float(np.median([one.share for one in figures])), "%"),
         ]
     )
     if choices:
@@ -119,8 +120,11 @@ def mask_report(
         section.table(rows, "How the foreground was found")
     edges = report.section(
         "Edges, worst first",
-        "The line is where coverage crosses one half; what is taken for background is dimmed. First those that "
-        "contradict the hull of the other views, then those with a remark, then the most unusual.",
+        "The line is where coverage crosses one half; what is taken for background is dimmed. How far a mask is off "
+        "the hull is the share of it that the other views' masks leave no room for, or the share of what they leave "
+        "that it alone removes, whichever is larger. With few views that is often much; masks that stand out "
+        "contradict the other views and are flagged. First come the flagged ones, then those with a remark, then the "
+        "others, those furthest off the hull first.",
     )
     shown = ordered[:SHOWN]
     tiles = [(_tile(*load(one.identity, one.camera)), _caption(one)) for one in shown]
@@ -131,7 +135,10 @@ def mask_report(
         "jpeg",
     )
     edges.table(
-        [_row(one) for one in ordered[:MAX_LISTED]], f"The first {min(len(ordered), MAX_LISTED)} of them"
+        [_row(one) for one in ordered[:MAX_LISTED]],
+        f"The first {min(len(ordered), MAX_LISTED)} of them: the foreground's share of the image, the soft edge's of "
+        "the foreground, and how far the mask is off the hull",
+        units=dict.fromkeys(("foreground", "soft", "off the hull"), "%"),
     )
     return report
 
@@ -148,17 +155,18 @@ def _tile(pixels: np.ndarray, alpha: np.ndarray) -> Picture:
 
 
 def _caption(one: MaskFigures) -> str:
-    doubt = "" if np.isnan(one.disagreement) else f" {one.disagreement:.0%} off"
-    return f"{one.identity} {one.camera}{doubt}{' FLAGGED' if one.flagged else ''}"
+    doubt = "" if np.isnan(one.disagreement) else f"{one.disagreement:.0%} off the hull"
+    mark = " FLAGGED" if one.flagged else " (remark)" if one.notes else ""
+    return f"{one.identity} {one.camera}\n{doubt}{mark}"
 
 
 def _row(one: MaskFigures) -> dict[str, Any]:
     return {
         "view": f"{one.identity} {one.camera}",
         "method": one.method,
-        "foreground": one.share,
-        "soft": one.soft,
-        "disagreement": one.disagreement,
-        "contradicts": one.flagged,
+        "foreground": 100 * one.share,
+        "soft": 100 * one.soft,
+        "off the hull": 100 * one.disagreement,
+        "flagged": one.flagged,
         "remarks": "; ".join(one.notes),
     }

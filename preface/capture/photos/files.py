@@ -51,14 +51,15 @@ class Photograph:
 
 def find_photographs(
     images: str | os.PathLike[str] | Sequence[Path],
-    sharing: Sharing,
+    sharing: Sharing | None,
     header_of: Callable[[Path], ImageHeader] = read_header,
 ) -> list[Photograph]:
     """List photographs, read their headers, and group them by camera.
 
     Args:
         images: a folder (its image files; with ``sharing="folder"`` those of its subfolders), or files.
-        sharing: ``one`` camera took all, one per ``folder``, or ``each`` photograph has its own.
+        sharing: ``one`` camera took all, one per ``folder``, or ``each`` photograph has its own; None is ``one`` where
+            the user has no choice.
         header_of: reads the header of a file; `preface.capture.upright.read_upright_header` where photographs are
             turned as EXIF says.
 
@@ -80,8 +81,11 @@ def find_photographs(
         remedy = f"Choose up to {MAX_PHOTOGRAPHS} sharp ones from all around; 100 are plenty"
         raise PhotoError(place, "photographs", f"are {len(paths)}, all to be compared in pairs", remedy)
     headers = [header_of(path) for path in paths]
-    cameras = _cameras(paths, sharing)
-    _check_sizes(paths, headers, cameras)
+    cameras = _cameras(paths, sharing or "one")
+    remedy = "Give photographs of one size and orientation"
+    if sharing is not None:
+        remedy += ", or say --cameras folder or --cameras each where several cameras took them"
+    _check_sizes(paths, headers, cameras, remedy)
     return [
         Photograph(name, path, header.width, header.height, camera, _exif_focal(path, header))
         for name, path, header, camera in zip(_ids(paths), paths, headers, cameras, strict=True)
@@ -124,7 +128,7 @@ def stage(photographs: Sequence[Photograph], masks: Path | None, folder: Path, t
     return names
 
 
-def _listed(images: str | os.PathLike[str], sharing: Sharing) -> list[Path]:
+def _listed(images: str | os.PathLike[str], sharing: Sharing | None) -> list[Path]:
     folder = Path(images)
     if not folder.is_dir():
         problem = "is not a folder" if folder.exists() else "does not exist"
@@ -146,7 +150,7 @@ def _cameras(paths: list[Path], sharing: Sharing) -> list[int]:
     return [order.index(key) for key in keys]
 
 
-def _check_sizes(paths: list[Path], headers: list[ImageHeader], cameras: list[int]) -> None:
+def _check_sizes(paths: list[Path], headers: list[ImageHeader], cameras: list[int], remedy: str) -> None:
     groups: dict[int, list[tuple[tuple[int, int], Path]]] = defaultdict(list)
     for path, header, camera in zip(paths, headers, cameras, strict=True):
         groups[camera].append(((header.width, header.height), path))
@@ -158,10 +162,6 @@ def _check_sizes(paths: list[Path], headers: list[ImageHeader], cameras: list[in
             more = f" (and {len(others) - 1} more)" if len(others) > 1 else ""
             problem = (
                 f"is {width}x{height}{more}, but most photographs of its camera are {usual[0]}x{usual[1]}"
-            )
-            remedy = (
-                "Give photographs of one size and orientation, or say that there is one camera per folder "
-                "or for each photograph"
             )
             raise PhotoError(path, "size", problem, remedy)
 

@@ -5,8 +5,8 @@
     evaluation.mean["psnr_face"], evaluation.views[0].rgb, evaluation.views[0].figures.values["psnr"]
 
 The truth is the photograph on black by its mask, over the whole frame, as in the paper; the render is what the head
-shows on black, so that what floats beside the head counts against it. A model that also models the background is
-masked as the photograph is.
+shows of the box on black, so that what floats beside the head counts against it. A prior that also models the
+background is masked as the photograph is: what it shows beside the head is background that it was asked to learn.
 """
 
 from __future__ import annotations

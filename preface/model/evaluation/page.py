@@ -13,7 +13,6 @@ from preface.model.evaluation.metrics_file import Measured
 from preface.model.evaluation.options import EvaluationOptions
 from preface.model.evaluation.sheets import (
     DEPTH_SHOWN,
-    ERROR_SHOWN,
     ViewPictures,
     comparison_sheet,
     face_sheet,
@@ -21,6 +20,7 @@ from preface.model.evaluation.sheets import (
     sheet,
 )
 from preface.model.evaluation.tables import FACE, FIGURE_COLUMNS, FOREGROUND, FRAME, row_of
+from preface.model.rendering.showing import ERROR_SHOWN
 from preface.reports import KeyFigure, Report, Section, new_figure
 
 UNITS = {"psnr_face": "dB", "psnr": "dB", "psnr_foreground": "dB"}

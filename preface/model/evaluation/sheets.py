@@ -15,10 +15,10 @@ import numpy as np
 
 from preface.model.evaluation.evaluate import EvaluatedView
 from preface.model.evaluation.metrics_file import FIGURES
+from preface.model.rendering.showing import ERROR_SHOWN, SMALLEST, error_picture, normals_picture, tile_size
 from preface.reports.pictures import Picture, as_picture, colorize, contact_sheet
 
-ERROR_SHOWN = 0.25  # of 1, at the bright end of the error map
-TALLEST, SMALLEST = 480, 200  # pixels of a tile's height: larger ones are reduced, smaller ones repeated
+TALLEST = 480  # pixels of a tile's height; larger images are reduced
 FACE_TALLEST, FACE_SMALLEST = 360, 240
 FACES_ACROSS = 2  # views per row of a sheet of faces, three tiles each
 DEPTH_SHOWN = 0.1  # metres before and behind the canonical origin that the colours of depth span
@@ -50,7 +50,7 @@ class ViewPictures:
 
 def view_pictures(view: EvaluatedView) -> ViewPictures:
     """The pictures of a view, reduced by area averaging where it is larger than a tile."""
-    error = colorize(np.abs(view.rgb - view.truth).mean(axis=-1), 0, ERROR_SHOWN, "inferno")
+    error = error_picture(view.rgb, view.truth)
     square, frames = view.figures.face, (as_picture(view.truth), as_picture(view.rgb), error)
     faces = [None if square is None else _reduced(square.of(frame), FACE_TALLEST) for frame in frames]
     truth, rgb, error = (_reduced(frame, TALLEST) for frame in frames)
@@ -63,7 +63,7 @@ def view_pictures(view: EvaluatedView) -> ViewPictures:
         rgb=rgb,
         error=error,
         depth=_reduced(depth, TALLEST),
-        normals=None if view.normals is None else _reduced(_shown(view.normals), TALLEST),
+        normals=None if view.normals is None else _reduced(normals_picture(view.normals), TALLEST),
         alpha=_reduced(as_picture(view.alpha), TALLEST),
         face_truth=faces[0],
         face_rgb=faces[1],
@@ -83,7 +83,7 @@ def sheet(views: Sequence[ViewPictures]) -> Picture:
             *([] if view.normals is None else [(view.normals, "normals")]),
             (view.alpha, "opacity"),
         ]
-    return contact_sheet(tiles, len(tiles) // len(views), _tile(views[0].truth, SMALLEST))
+    return contact_sheet(tiles, len(tiles) // len(views), _tile(views[0].truth))
 
 
 def face_sheet(views: Sequence[ViewPictures]) -> Picture | None:
@@ -117,18 +117,13 @@ def comparison_sheet(heads: Sequence[tuple[str, Sequence[ViewPictures]]]) -> Pic
                 (other.rgb, f"{other.figures['psnr']:.2f} dB, {name}"),
                 (other.error, f"error, 0 to {ERROR_SHOWN}"),
             ]
-    return contact_sheet(tiles, 1 + 2 * len(heads), _tile(heads[0][1][0].truth, SMALLEST))
+    return contact_sheet(tiles, 1 + 2 * len(heads), _tile(heads[0][1][0].truth))
 
 
 def input_sheet(photographs: Sequence[tuple[np.ndarray, str]]) -> Picture:
     """The photographs that a head was fitted to, [H, W, 3] on black, with the names of their cameras."""
     tiles = [(_reduced(as_picture(truth), TALLEST), name) for truth, name in photographs]
-    return contact_sheet(tiles, 7, _tile(tiles[0][0], SMALLEST))
-
-
-def _shown(normals: np.ndarray) -> Picture:
-    """Normals [H, W, 3] as colours, black where there is none."""
-    return as_picture(np.where(np.isnan(normals), 0.0, (normals + 1) / 2).astype(np.float32))
+    return contact_sheet(tiles, 7, _tile(tiles[0][0]))
 
 
 def _reduced(picture: Picture, tallest: int) -> Picture:
@@ -140,8 +135,6 @@ def _reduced(picture: Picture, tallest: int) -> Picture:
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
 
 
-def _tile(picture: Picture, smallest: int) -> tuple[int, int]:
-    """Width and height of tiles: the picture's, by a whole factor that makes them at least so tall."""
+def _tile(picture: Picture, smallest: int = SMALLEST) -> tuple[int, int]:
     height, width = picture.shape[:2]
-    factor = max(1, -(-smallest // height))
-    return width * factor, height * factor
+    return tile_size(width, height, smallest)

@@ -14,10 +14,11 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from preface.model.configuration import PRESETS, ModelConfig
+from preface.model.configuration import MAX_LEVELS, PRESETS, ModelConfig, carried_levels
 from preface.model.training.configuration import TrainingConfigError, require
 
 Start = Literal["zeros", "noise", "mean", "nearest", "furthest"]
+Quality = Literal["draft", "balanced", "reference", "paper"]
 MAX_VIEWS = 7
 # Finetuning steps by the side of a square image (the paper, supplementary material, finetuned model).
 PAPER_STEPS = ((256, 25_000), (512, 50_000), (1024, 100_000), (2048, 200_000), (4096, 300_000))
@@ -95,6 +96,13 @@ class FinetuningConfig:
     them. The paper: 0.001."""
     view_weights: float = 1e-4
     """Weight of the squared norm of the weights that see the direction; 0 does without. The paper: 0.0001."""
+    orientation: float = 0.0
+    """Weight of Ref-NeRF's penalty on visible normals that face away from the camera; 0 for none. The paper: none."""
+    levels: int | Literal["auto", "prior"] = "prior"
+    """Levels of the position's encoding: those of the `prior`, as many as the views can carry if these are more
+    (`auto`), or a number, not below the prior's. For views finer than the prior's images and long fits: after 300 steps
+    at 256x384 a twelfth level beside eleven gained nothing. With --prior none this holds for --like; otherwise
+    --model.levels does. The paper: 12 for prior and head, at any resolution."""
     frozen_latent: bool = False
     """Keep the code that inversion found, and adapt the networks only."""
 
@@ -137,9 +145,10 @@ class FitConfig:
     """Whose views; may be left out where the shards hold one identity only."""
     views: tuple[str, ...] = ()
     """Names of one to seven cameras."""
-    quality: Literal["draft", "balanced", "reference"] = "balanced"
-    """Which defaults all flags below have: for a minute and a half or for six on two processor cores with a small
-    prior, or the paper's."""
+    quality: Quality = "balanced"
+    """Which defaults all flags below have: `draft`, `balanced` and `reference` are three points of the measured
+    front of time and error with a small prior on processors, each over three times as long as the one before; `paper`
+    has the paper's numbers, which are for a GPU."""
     refine_cameras: bool = False
     """Find small corrections of the cameras, too, and keep them if the views agree much better with them. Needs a
     prior."""
@@ -180,10 +189,12 @@ class FitConfig:
 
 
 # By name. With the `small` prior, two views of 96x144 and few steps: the paper's rate hardly moves inversion's code (in
-# 60 steps held-out views gain 0.6 dB, 6 dB at 1e-2; 2e-2 is there in 40). Finetuning at 3e-3 is 0.7 dB ahead after 50
-# steps and gains nothing from 100 to 200; 1e-2 loses 5 dB. Half the rays in twice the steps gain 0.65 dB, and half of
-# the rays on the head 0.4 dB, both at 50 steps of 512 rays. Opacity held against masks, in a `tiny` prior and the fit,
-# gained 0.9 dB on a head of black hair, and an IoU of silhouettes of 0.95 in place of 0.61.
+# 60 steps held-out views gain 0.6 dB, 6 dB at 1e-2; 2e-2 is there in 40, and 100 gain nothing once finetuned).
+# Finetuning at 3e-3 is 0.7 dB ahead after 50 steps, and 0.5 dB behind 1e-3 after 200; 2e-3 is 0.3 dB behind after 800.
+# Half the rays in twice the steps gain 0.65 dB, and half of the rays on the head 0.4 dB, both at 50 steps of 512 rays.
+# Opacity held against masks, in a `tiny` prior and the fit, gained 0.9 dB on a head of black hair, and an IoU of
+# silhouettes of 0.95 in place of 0.61. From 800 to 3,000 steps SSIM and LPIPS gain as much as from 200 to 800, and PSNR
+# nothing more. At so few steps regularisers change no figure; normals are what gives a head its predicted ones.
 QUALITIES: dict[str, tuple[InversionConfig, FinetuningConfig, FitRunConfig]] = {
     "draft": (
         InversionConfig(steps=40, patches=2, patch=16, rate=2e-2),
@@ -191,11 +202,16 @@ QUALITIES: dict[str, tuple[InversionConfig, FinetuningConfig, FitRunConfig]] = {
         FitRunConfig(micro_rays=512, preview_every=0),
     ),
     "balanced": (
-        InversionConfig(steps=80, patches=4, patch=16, rate=1e-2),
-        FinetuningConfig(steps=600, rays=512, foreground_share=0.5, opacity=0.1),
+        InversionConfig(steps=40, patches=2, patch=16, rate=2e-2),
+        FinetuningConfig(steps=800, rays=256, foreground_share=0.5, opacity=0.1),
         FitRunConfig(micro_rays=512, preview_every=0),
     ),
-    "reference": (InversionConfig(), FinetuningConfig(), FitRunConfig()),
+    "reference": (
+        InversionConfig(steps=40, patches=2, patch=16, rate=2e-2),
+        FinetuningConfig(steps=3000, rays=256, foreground_share=0.5, opacity=0.1),
+        FitRunConfig(micro_rays=512, preview_every=0),
+    ),
+    "paper": (InversionConfig(), FinetuningConfig(), FitRunConfig()),
 }
 
 
@@ -228,6 +244,27 @@ def finetuning_steps(config: FinetuningConfig, width: int, height: int) -> int:
     return steps[-1]
 
 
+def finetuning_levels(config: FinetuningConfig, known: int, smallest_radius: float) -> int:
+    """Levels of the encoding that finetuning works with, never fewer than there are.
+
+    Args:
+        config: see there.
+        known: levels that the model has.
+        smallest_radius: of the views' pixels, as `carried_levels` takes it; 0 of cameras within the box, which do not
+            tell how near the head is, so that the model keeps its own.
+
+    Raises:
+        TrainingConfigError: fewer are asked for.
+    """
+    if config.levels == "prior" or (config.levels == "auto" and smallest_radius <= 0):
+        return known
+    if config.levels == "auto":
+        return max(known, carried_levels(smallest_radius))
+    remedy = f"the prior has {known}; give that or more, auto or prior"
+    require(config.levels >= known, "finetuning.levels", config.levels, remedy)
+    return config.levels
+
+
 def check(config: FitConfig) -> None:
     """Refuse values that cannot work.
 
@@ -252,11 +289,15 @@ def check(config: FitConfig) -> None:
         "opacity": 0,
         "normals": 0,
         "view_weights": 0,
+        "orientation": 0,
     }
     if finetuning.steps != "auto":
         numbers["steps"] = 0
     _check_numbers("finetuning.", finetuning, numbers)
     _check_rates("finetuning.", finetuning, ("rate", "rate_last", "eps"))
+    levels = finetuning.levels
+    possible = isinstance(levels, str) or 0 <= levels <= MAX_LEVELS
+    require(possible, "finetuning.levels", levels, f"give 0 to {MAX_LEVELS}, auto or prior")
     _check_share("finetuning.foreground-share", finetuning.foreground_share)
     limits = {"micro_rays": 1, "log_every": 1, "checkpoint_minutes": 0, "preview_every": 0}
     _check_numbers("", run, limits)

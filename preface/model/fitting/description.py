@@ -1,4 +1,4 @@
-"""What model.json says of a head before its first step, and where the phases of its fit end."""
+"""What model.json says of a head before its first step, where the phases of its fit end, and what it comes to know."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from preface.artifacts import provenance, sha256
 from preface.model.configuration import ModelConfig
-from preface.model.fitting.configuration import FitConfig, finetuning_steps
+from preface.model.fitting.configuration import FitConfig, finetuning_levels, finetuning_steps
 from preface.model.training.data import TrainingData
 from preface.model.training.prior_files import MODEL_FILE, Prior
 
@@ -27,6 +27,24 @@ def ends_of(config: FitConfig, width: int, height: int) -> Ends:
     cameras = inversion + config.cameras.steps * config.refine_cameras
     again = cameras + inversion * config.refine_cameras
     return Ends(inversion, cameras, again, again + finetuning_steps(config.finetuning, width, height))
+
+
+def levels_of_head(config: FitConfig, prior: Prior | None, smallest_radius: float) -> int:
+    """Levels of the encoding that a head ends with.
+
+    Args:
+        config: of the fit.
+        prior: that it begins with, if any.
+        smallest_radius: of the views' pixels, as `carried_levels` takes it.
+
+    Raises:
+        TrainingConfigError: fewer are asked for than there are.
+    """
+    known = (config.model if prior is None else prior.model).resolved(smallest_radius).levels
+    assert isinstance(known, int)
+    if prior is None and config.like is None:
+        return known
+    return finetuning_levels(config.finetuning, known, smallest_radius)
 
 
 def inputs_of(data: TrainingData, prior: Prior | None) -> dict[str, Path]:

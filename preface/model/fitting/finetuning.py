@@ -1,10 +1,13 @@
 """Finetuning: all weights, and the code, adapt to the views; regularised so that new views stay a face.
 
 The paper, equation 3: absolute difference, interlevel loss, predicted normals whose second-order gradients reach the
-density, and the squared norm of the weights through which the direction acts.
+density, and the squared norm of the weights through which the direction acts. Opacity and orientation are ours to ask
+for.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -14,6 +17,7 @@ from preface.model.fitting.configuration import FinetuningConfig
 from preface.model.fitting.heads import Correction, head_renderer
 from preface.model.fitting.observations import view_loader
 from preface.model.model import PriorModel, Render
+from preface.model.rays import Rays
 from preface.model.training.data import TrainingData
 from preface.model.training.prior_loss import color_terms, interlevel, opacity
 from preface.model.training.schedule import LogLinear
@@ -56,8 +60,10 @@ def finetuning_trainer(
     sampler = SingleRays(data.train, seed, config.rays, config.foreground_share)
     trainer = Trainer(
         parameter_sets(model, config, steps),
-        finetuning_terms(model, config),
-        head_renderer(model, seed, share_done, correction),
+        finetuning_terms(model, config, correction),
+        head_renderer(
+            model, seed, share_done, correction, normals=config.normals > 0 or config.orientation > 0
+        ),
         Options(eps=config.eps, micro_rays=micro_rays),
         sampler.groups,
     )
@@ -77,13 +83,17 @@ def parameter_sets(model: PriorModel, config: FinetuningConfig, steps: int) -> l
     ]
 
 
-def finetuning_terms(model: PriorModel, config: FinetuningConfig) -> list[LossTerm]:
-    """The paper's objective, equation 3; and opacity, if asked for."""
+def finetuning_terms(
+    model: PriorModel, config: FinetuningConfig, correction: Correction | None = None
+) -> list[LossTerm]:
+    """The paper's objective, equation 3; and opacity and orientation, if asked for."""
     terms = [*color_terms("black"), LossTerm("interlevel", config.interlevel, interlevel)]
     if config.opacity > 0:
         terms.append(LossTerm("opacity", config.opacity, opacity))
     if config.normals > 0:
         terms.append(LossTerm("normals", config.normals, predicted_normals))
+    if config.orientation > 0:
+        terms.append(LossTerm("orientation", config.orientation, orientation_seen_through(correction)))
     if config.view_weights > 0:
         layer, features = model.nerf.view.weight, 3 + 6 * model.config.view_levels
 
@@ -100,3 +110,16 @@ def predicted_normals(render: Render, part: Part) -> Tensor:
     assert render.normals_pred is not None
     weights = render.levels[-1].weights
     return losses.predicted_normal(weights, render.normals, render.normals_pred) * render.share
+
+
+def orientation_seen_through(correction: Correction | None) -> Callable[[Render, Part], Tensor]:
+    """The mean over all rays of Ref-NeRF's penalty on normals that face away, by the directions that were rendered."""
+
+    def orientation(render: Render, part: Part) -> Tensor:
+        assert render.normals is not None
+        rays = Rays.from_batch(part.batch)
+        rays = rays if correction is None else correction.apply(rays, part.batch.view)
+        some = rays if render.evaluated is None else rays[render.evaluated]
+        return losses.orientation(render.levels[-1].weights, render.normals, some.viewdirs) * render.share
+
+    return orientation

@@ -21,14 +21,9 @@ from preface.model.training.prior_loss import jitter
 from preface.model.training.trainer import Part
 
 
-def head_config(model: ModelConfig) -> ModelConfig:
-    """The configuration of a head that begins with a model."""
-    return replace(model, clip_to_box=True, background="black")
-
-
 def head_of_prior(prior: PriorModel, code: Tensor) -> PriorModel:
     """The prior's networks with one code [latent]; a copy."""
-    head = PriorModel(head_config(prior.config), 1).to(code.device)
+    head = PriorModel(prior.config.within_the_box(), 1).to(code.device)
     head.load_state_dict({**prior.state_dict(), "codes": code[None]})
     return head
 
@@ -37,7 +32,7 @@ def head_from_scratch(model: ModelConfig, seed: int) -> PriorModel:
     """Random weights as a function of the seed, and no code: the architecture without what a prior learned."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return PriorModel(replace(head_config(model), latent=0, predicted_normals=False), 1)
+        return PriorModel(replace(model.within_the_box(), latent=0, predicted_normals=False), 1)
 
 
 def with_predicted_normals(model: PriorModel, seed: int) -> PriorModel:
@@ -81,7 +76,12 @@ class Correction:
 
 
 def head_renderer(
-    model: PriorModel, seed: int, share_done: Callable[[int], float], correction: Correction | None = None
+    model: PriorModel,
+    seed: int,
+    share_done: Callable[[int], float],
+    correction: Correction | None = None,
+    *,
+    normals: bool = False,
 ) -> Callable[[Part], Render]:
     """Render parts of a step with a head.
 
@@ -90,6 +90,7 @@ def head_renderer(
         seed: of the places of samples.
         share_done: of a step, for annealing; 1 for networks that know where to look.
         correction: of the cameras, if there is one.
+        normals: whether the density's normals are found, and with them those that a layer predicts.
     """
     rounds = len(model.config.samples)
 
@@ -102,6 +103,7 @@ def head_renderer(
             code_of(model),
             train_frac=share_done(part.step),
             jitter=noise.to(batch.origins.device),
+            normals=normals,
         )
 
     return render

@@ -67,7 +67,7 @@ def observe(
     return data
 
 
-def fitted_views(data: TrainingData, cameras: Sequence[str]) -> np.ndarray:
+def view_numbers(data: TrainingData, cameras: Sequence[str]) -> np.ndarray:
     """Numbers of views by the names of their cameras, int64 [n, 2], identity and view, in the order of the names."""
     person = int(data.train.identities[0])
     known = data.dataset.manifest.identities[person].cameras

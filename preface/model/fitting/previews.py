@@ -12,6 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from preface.geometry import Box, Camera, Rigid
+from preface.model.evaluation.options import LARGEST_PSNR
 from preface.model.fitting.cameras import corrected_pose
 from preface.model.fitting.heads import Correction, code_of
 from preface.model.fitting.reduction import reduce_pixels
@@ -19,8 +20,8 @@ from preface.model.metrics.image_quality import psnr
 from preface.model.model import PriorModel
 from preface.model.rendering.image import RenderedImage, Space, render_image
 from preface.model.rendering.shortcuts import DEFAULT_QUALITY, QUALITIES, accelerate
+from preface.model.rendering.showing import ERROR_SHOWN, error_picture, normals_picture, tile_size
 from preface.model.training.data import TrainingData
-from preface.model.training.validation import ERROR_SHOWN, tile_size
 from preface.reports.pictures import Picture, as_picture, colorize, contact_sheet
 from preface.shards.heads import standing
 
@@ -76,17 +77,15 @@ class Previewer:
         camera, pose = self._camera(person, view)
         truth = self._truth(person, view)
         seen, new = render(camera, pose), render(camera, turned_away(pose))
-        error = np.abs(seen.rgb - truth).mean(axis=-1)
-        quality = min(psnr(torch.from_numpy(seen.rgb), torch.from_numpy(truth)), 100.0)
+        quality = min(psnr(torch.from_numpy(seen.rgb), torch.from_numpy(truth)), LARGEST_PSNR)
         depths = self.data.scene.near_far
         assert seen.normals is not None
-        shown = np.where(np.isnan(seen.normals), 0.0, 0.5 + 0.5 * seen.normals)
         row = [
             (as_picture(truth), str(entry.cameras[view])),
             (as_picture(seen.rgb), f"{quality:.2f} dB"),
-            (colorize(error, 0, ERROR_SHOWN, "inferno"), f"error to {ERROR_SHOWN}"),
+            (error_picture(seen.rgb, truth), f"error, 0 to {ERROR_SHOWN}"),
             (colorize(seen.depth, *depths, "viridis"), "depth"),
-            (as_picture(shown), "normals"),
+            (normals_picture(seen.normals), "normals"),
             (as_picture(new.rgb), "a new view"),
         ]
         return row, quality

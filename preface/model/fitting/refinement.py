@@ -29,7 +29,7 @@ from preface.model.training.schedule import LogLinear
 from preface.model.training.trainer import LossTerm, Options, ParameterSet, Part, Trainer
 from preface.shards import Loader, SingleRays
 
-_COMPARED = 48  # pixels per side of a view on which corrections are judged
+_JUDGED_GRID = 48  # pixels per side of a view on which corrections are judged
 
 
 def refinement_trainer(
@@ -83,7 +83,7 @@ def gain(model: PriorModel, correction: Correction, data: TrainingData, device: 
     """
     before, after = 0.0, 0.0
     with torch.no_grad():
-        for batch in grids(data, _COMPARED, device):
+        for batch in grids(data, _JUDGED_GRID, device):
             given, truth = Rays.from_batch(batch), target_colors(batch, "black")
             corrected = correction.apply(given, batch.view)
             before, after = (
@@ -91,3 +91,9 @@ def gain(model: PriorModel, correction: Correction, data: TrainingData, device: 
                 for total, rays in ((before, given), (after, corrected))
             )
     return 10 * math.log10(before / after) if after > 0 and before > 0 else 0.0
+
+
+def said_of_gain(found: float, least: float) -> str:
+    """The judgement on corrections that gained so much, dB, of what it takes."""
+    words = "kept" if found >= least else "the cameras stay as they were"
+    return f"cameras: views are met {found:+.2f} dB better, of the {least:g} dB that it takes: {words}"

@@ -17,29 +17,36 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from preface.artifacts import ArtifactError, provenance
 from preface.geometry import Box
 from preface.model.configuration import ModelConfig
+from preface.model.fitting.beginning import (
+    checkpoint_of,
+    like_its_prior,
+    may_correct,
+    note_template,
+    prior_of,
+)
 from preface.model.fitting.cameras import CameraCorrections
 from preface.model.fitting.configuration import FitConfig, check
-from preface.model.fitting.description import described_head, ends_of, inputs_of
+from preface.model.fitting.description import described_head, ends_of, levels_of_head
 from preface.model.fitting.finetuning import finetuning_trainer
 from preface.model.fitting.heads import Correction, head_from_scratch, head_of_prior, with_predicted_normals
 from preface.model.fitting.inversion import inversion_trainer
-from preface.model.fitting.observations import fitted_views, grids, observe, template_gap
+from preface.model.fitting.observations import grids, observe, view_numbers
 from preface.model.fitting.previews import Previewer
 from preface.model.fitting.reduction import FOLDER, reduce_views, reduced_size
-from preface.model.fitting.refinement import gain, refinement_trainer
+from preface.model.fitting.refinement import gain, refinement_trainer, said_of_gain
 from preface.model.fitting.starts import start_code
+from preface.model.levels import with_levels
 from preface.model.model import PriorModel
 from preface.model.training.checkpoint import STATE, WEIGHTS, read_tensors, write_checkpoint
 from preface.model.training.configuration import TrainingConfigError
 from preface.model.training.data import TrainingData
-from preface.model.training.folder import held_folder, require_same_run, show
+from preface.model.training.folder import held_folder, show
 from preface.model.training.interruption import Interruption
 from preface.model.training.logs import RunLog
-from preface.model.training.loop import Ended, Pace, Phase, Say, take_steps
-from preface.model.training.prior_files import MODEL_FILE, Prior, prior_payload, read_prior
+from preface.model.training.loop import Ended, Pace, Phase, Say, memory_explained, take_steps
+from preface.model.training.prior_files import Prior, prior_payload
 from preface.model.training.products import chosen_products
 from preface.model.training.progress import Progress, train_flops_per_ray
 from preface.model.training.ranks import Ranks, device_of_rank
@@ -47,8 +54,7 @@ from preface.model.training.trainer import Outcome, Trainer
 from preface.shards import Dataset, Loader
 
 PREVIEWS = "previews"
-_SAME_TEMPLATE = 1e-3  # metres; keypoints are found to some millimetres
-_COMPARED = 16  # pixels per side of a view that neighbours are sought by
+_START_GRID = 16  # pixels per side of a view by which the identity to start from is sought
 
 
 def fit_head(config: FitConfig, say: Say) -> Ended:
@@ -68,71 +74,23 @@ def fit_head(config: FitConfig, say: Say) -> Ended:
         device = device_of_rank(config.run.device)
     except ValueError as error:
         raise TrainingConfigError(str(error)) from error
-    prior = _read_prior(config.prior, say) if config.from_prior else None
-    if config.like is not None:
-        config = replace(config, model=read_prior(config.like).model)
+    prior, config = prior_of(config, say), like_its_prior(config)
     with Dataset(config.shards) as dataset:
         data = observe(dataset, config.identity, config.views, prior)
+        levels = levels_of_head(config, prior, data.smallest_radius)
         if prior is not None:
-            _note_template(dataset, prior, say)
+            note_template(dataset, prior, say)
         config = replace(config, identity=data.names[0])
         with held_folder(config.output, Ranks()):
-            before = _resumed(config, data, prior)
+            before = checkpoint_of(config, data, prior)
             if before is not None and before.finished and _preview(config.output, before.step).exists():
                 say(f"{config.output}: all {before.steps:,} steps are taken already")
                 return Ended(before.path, 0)
-            return _Fit(config, data, prior, before, device, say).go()
-
-
-def _read_prior(path: str | Path, say: Say) -> Prior:
-    prior = read_prior(path)
-    if prior.is_head:
-        problem = "is that of a head, which knows one identity"
-        raise ArtifactError(prior.path, "fit", problem, "Give the folder of a prior, or --prior none")
-    if not prior.finished:
-        say(
-            f"{path}: trained for {prior.step:,} of {prior.steps:,} steps only; the fit can be as good as that"
-        )
-    return prior
-
-
-def _note_template(dataset: Dataset, prior: Prior, say: Say) -> None:
-    """Tell of faces that are elsewhere than the prior expects them."""
-    gap = template_gap(dataset, prior)
-    if gap is not None and gap > _SAME_TEMPLATE:
-        say(
-            f"note: the people of {dataset.manifest.path.parent} were placed on another template than the prior's, "
-            f"{1e3 * gap:.1f} mm away (RMS); align them with preface-align --template and the prior's folder, or the "
-            "word pretrained"
-        )
-
-
-def _resumed(config: FitConfig, data: TrainingData, prior: Prior | None) -> Prior | None:
-    """The checkpoint to go on from, None to begin.
-
-    Raises:
-        ArtifactError: it is a prior's, or of another fit; the message names what differs.
-    """
-    if not (config.output / MODEL_FILE).exists():
-        return None
-    before = read_prior(config.output)
-    if not before.is_head:
-        problem = "is that of a prior, which a fit would overwrite"
-        raise ArtifactError(before.path, "fit", problem, "Choose another --output")
-    inputs = provenance({}, inputs_of(data, prior))["inputs"]
-    ours = {**config.to_dict(), "inputs": inputs}
-    require_same_run(before.path, ours, {**before.configuration, "inputs": dict(before.provenance["inputs"])})
-    return before
+            return _Fit(config, data, prior, before, levels, device, say).go()
 
 
 def _preview(folder: Path, step: int) -> Path:
     return folder / PREVIEWS / f"views-{step:08d}.png"
-
-
-def _may_correct(before: Prior) -> bool:
-    """Whether the checkpoint's corrections were kept, or are not judged yet."""
-    assert before.fit is not None
-    return bool(before.fit.get("refinement", {"kept": True})["kept"])
 
 
 class _Fit:
@@ -144,18 +102,20 @@ class _Fit:
         data: TrainingData,
         prior: Prior | None,
         before: Prior | None,
+        levels: int,
         device: torch.device,
         say: Say,
     ):
         self.config, self.data, self.device, self.say = config, data, device, say
+        self._levels = levels
         self.output, self.ranks = config.output, Ranks()
         self._open = contextlib.ExitStack()
         self._prior, self._before = prior, before
         self._ends = ends_of(config, *data.scene.resolution)
-        self._pairs = fitted_views(data, config.views)
+        self._pairs = view_numbers(data, config.views)
         self._phase: Phase | None = None
         self._correction = None
-        if config.refine_cameras and (before is None or _may_correct(before)):
+        if config.refine_cameras and (before is None or may_correct(before)):
             self._correction = self._corrections(before)
         self._reduced: TrainingData | None = None
         self.model, self.head = self._new() if before is None else (before.load_model().to(device), before)
@@ -183,7 +143,8 @@ class _Fit:
                     return Ended(self.head.path, interruption.exit_status)
             if not _preview(self.output, self.head.step).exists():  # the last phase had no steps
                 self.save()
-                self.look(log, last=True)
+                with memory_explained("what was found could not be shown", self._less()):
+                    self.look(log, last=True)
         return Ended(self.head.path, 0)
 
     def _plan(self) -> str:
@@ -200,7 +161,7 @@ class _Fit:
         """A head to begin with: the prior's, where its code starts, or random weights."""
         config = self.config
         if self._prior is None:
-            model = head_from_scratch(config.model.resolved(self.data.smallest_radius), config.seed)
+            model = head_from_scratch(replace(config.model, levels=self._levels), config.seed)
             return model.to(self.device), self._described(model.config)
         networks = self._prior.load_model().to(self.device)
         head = head_of_prior(networks, self._start_code(networks))
@@ -210,7 +171,7 @@ class _Fit:
         return described_head(self.config, self.data, self._prior, model, self._ends)
 
     def _start_code(self, networks: PriorModel) -> Tensor:
-        views = grids(self.data, _COMPARED, self.device)
+        views = grids(self.data, _START_GRID, self.device)
         return start_code(networks, self.config.inversion.start, views, self.config.seed)
 
     def _inversion(self) -> Phase | None:
@@ -224,10 +185,12 @@ class _Fit:
         trainer, loader = inversion_trainer(
             self.model, config, data, self.config.seed, run.micro_rays, self.device, correction
         )
-        less = f"--inversion.patches {max(config.patches // 2, 1)} or a smaller --inversion.patch"
+        less = (
+            f"fit again with --inversion.patches {max(config.patches // 2, 1)} or a smaller --inversion.patch"
+        )
         remedy = "fit into another --output with a lower --inversion.rate"
         steps = self._ends.inversion
-        return self._phase_of("inversion", trainer, loader, before, steps, remedy, f"fit again with {less}")
+        return self._phase_of("inversion", trainer, loader, before, steps, remedy, less)
 
     def _refinement(self) -> Phase | None:
         """The steps in which cameras move that are left; None if there are none."""
@@ -239,15 +202,15 @@ class _Fit:
         trainer, loader = refinement_trainer(
             self.model, config, data, self.config.seed, run.micro_rays, self.device, correction
         )
-        less = f"--micro-rays {max(run.micro_rays // 2, 1)}, which changes nothing but the time"
         remedy = "fit into another --output with a lower --cameras.rate"
         before, steps = self._ends.inversion, config.steps
-        return self._phase_of("cameras", trainer, loader, before, steps, remedy, f"fit again with {less}")
+        return self._phase_of("cameras", trainer, loader, before, steps, remedy, self._less())
 
     def _second_inversion(self) -> Phase | None:
         """Inversion's steps with corrected cameras that are left; None without, or where they are not kept."""
+        self._judge()
         correction = self._correction
-        if correction is None or not self._kept(correction) or self.head.step >= self._ends.second_inversion:
+        if correction is None or self.head.step >= self._ends.second_inversion:
             return None
         phase = self._inverting(self._ends.cameras, self._seen_through(correction, self._as_the_prior_sees()))
         if phase.start == 0:
@@ -256,25 +219,28 @@ class _Fit:
                 self.model.codes.copy_(self._start_code(self._prior.load_model().to(self.device))[None])
         return phase
 
-    def _kept(self, correction: Correction) -> bool:
-        """Whether the corrections are kept, found out once; if not, the second inversion counts as done."""
+    def _judge(self) -> None:
+        """Keep the corrections or drop them, found out once; nothing moves them from here on."""
+        correction = self._correction
+        if correction is None:
+            return
         assert self.head.fit is not None
-        if "refinement" not in self.head.fit:
-            data, least = self._as_the_prior_sees(), self.config.cameras.least_gain
-            found = gain(self.model, self._seen_through(correction, data), data, self.device)
-            kept = found >= least
-            fit = {**self.head.fit, "refinement": {"gain_db": found, "kept": kept}}
-            self.head = replace(self.head, fit=fit)
-            words = "kept" if kept else "the cameras stay as they were"
-            self.say(
-                f"cameras: views are met {found:+.2f} dB better, of the {least:g} dB that it takes: {words}"
-            )
-            if not kept:
-                self._correction = None
-                self.head = replace(self.head, step=self._ends.second_inversion, fit={**fit, "cameras": {}})
-            self.save()  # there may be no step after it that would
-        correction.cameras.requires_grad_(False)  # nothing moves them from here on
-        return self._correction is not None
+        correction.cameras.requires_grad_(False)
+        if "refinement" in self.head.fit:
+            return
+        data, least = self._as_the_prior_sees(), self.config.cameras.least_gain
+        found = gain(self.model, self._seen_through(correction, data), data, self.device)
+        self.say(said_of_gain(found, least))
+        self._note_gain(found, found >= least)
+        self.save()  # there may be no step after it that would
+
+    def _note_gain(self, found: float, kept: bool) -> None:
+        """Note what was found; corrections that are not kept are forgotten, and the second inversion is done."""
+        fit = {**(self.head.fit or {}), "refinement": {"gain_db": found, "kept": kept}}
+        self.head = replace(self.head, fit=fit)
+        if not kept:
+            self._correction = None
+            self.head = replace(self.head, step=self._ends.second_inversion, fit={**fit, "cameras": {}})
 
     def _as_the_prior_sees(self) -> TrainingData:
         """The views at the prior's resolution."""
@@ -301,9 +267,7 @@ class _Fit:
         config, run = self.config.finetuning, self.config.run
         if steps == 0:
             return None
-        if config.normals > 0:
-            self.model = with_predicted_normals(self.model, self.config.seed)
-            self.head = replace(self.head, model=self.model.config)
+        self._grow()
         trainer, loader = finetuning_trainer(
             self.model,
             config,
@@ -315,7 +279,6 @@ class _Fit:
             knows_heads=self._prior is not None,
             correction=self._correction,
         )
-        less = f"--micro-rays {max(run.micro_rays // 2, 1)}, which changes nothing but the time"
         remedy = "fit into another --output with a lower --finetuning.rate"
         return self._phase_of(
             "finetuning",
@@ -324,8 +287,20 @@ class _Fit:
             self._ends.second_inversion,
             steps,
             remedy,
-            f"fit again with {less}",
+            self._less(),
         )
+
+    def _grow(self) -> None:
+        """Give the model what finetuning asks for: levels for what the views show, and the layer for normals."""
+        if self.model.levels < self._levels:
+            before, self.model = self.model.levels, with_levels(self.model, self._levels)
+            self.say(
+                f"finetuning: {self._levels} levels of the encoding, of which the prior has {before}; the others, "
+                "which are finer, begin at zero"
+            )
+        if self.config.finetuning.normals > 0:
+            self.model = with_predicted_normals(self.model, self.config.seed)
+        self.head = replace(self.head, model=self.model.config)
 
     def _phase_of(
         self, kind: str, trainer: Trainer, loader: Loader, before: int, steps: int, remedy: str, less: str
@@ -340,10 +315,16 @@ class _Fit:
             Pace(run.log_every, every, 0.0, run.checkpoint_minutes),
             remedy,
             less,
+            self._less(),
             kind,
             f"{kind}: ",
             before,
         )
+
+    def _less(self) -> str:
+        """What to do when memory runs out where rays go through the networks `micro_rays` at a time."""
+        fewer = max(self.config.run.micro_rays // 2, 1)
+        return f"fit again with --micro-rays {fewer}, which changes nothing but the time"
 
     def _resume(self, phase: Phase) -> None:
         """Give the phase that a checkpoint was written in what Adam remembered."""

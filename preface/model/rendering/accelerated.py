@@ -7,7 +7,9 @@ Four questions, each cheaper than the next: does a ray meet anything (`_met`), w
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,11 +21,14 @@ from torch.nn.functional import pad
 from preface.model import coord, encoding, losses, sampling, stepfun, volume
 from preface.model.configuration import ModelConfig
 from preface.model.folded import fold
+from preface.model.levels import with_levels
+from preface.model.matmul import Precision, choose_route
 from preface.model.model import Level, PriorModel, Render
-from preface.model.networks import Products, Trunk
+from preface.model.networks import Products
 from preface.model.rays import Rays
 from preface.model.rendering.image import SEEN, RenderRays, Space
-from preface.model.rendering.occupancy import Occupancy, learn_occupancy, model_density
+from preface.model.rendering.mesh import model_field
+from preface.model.rendering.occupancy import Occupancy, learn_occupancy
 from preface.model.rendering.samples import encode_samples
 from preface.model.rendering.shortcuts import Shortcuts
 from preface.model.safe_math import interpolate_sorted
@@ -48,6 +53,9 @@ def accelerated(
     if (code is None) != (model.config.latent == 0):
         given = "none" if code is None else f"one of {len(code)} numbers"
         raise ValueError(f"code: {given} was given to a model with codes of {model.config.latent}")
+    model = _within_the_box(model)
+    if shortcuts.matmul:
+        shortcuts = dataclasses.replace(shortcuts, matmul=precision_of(model, shortcuts))
     if code is not None and shortcuts != Shortcuts():
         model, code = fold(model, code), None
     if shortcuts.changes_model:
@@ -57,9 +65,40 @@ def accelerated(
     grid = None
     if shortcuts.occupancy:
         side = float((space.box.maximum - space.box.minimum).max()) * space.scale / shortcuts.occupancy
-        density, device = model_density(model, side), model.basis.device
+        density, device = model_field(model, None, side).density, model.basis.device
         grid = learn_occupancy(density, space, shortcuts.occupancy, shortcuts.empty_alpha, device)
     return ShortRenderer(model, grid, shortcuts, space.scale, background, normals)
+
+
+def precision_of(model: PriorModel, shortcuts: Shortcuts) -> Precision:
+    """The precision in which a model's products are formed with shortcuts, on the device where it is."""
+    if shortcuts.matmul != "bf16":
+        return shortcuts.matmul or model.config.matmul
+    return _fastest_precision(model.basis.device.type, model.config.nerf.width)
+
+
+@functools.cache
+def _fastest_precision(device: str, width: int) -> Precision:
+    """The precision in which layers of a width are multiplied fastest by a kind of device, found by trying, once.
+
+    A processor without products of bfloat16 makes them from others, several times more slowly than float32's. On
+    other devices they are the fastest.
+    """
+    if device != "cpu":
+        return "bf16"
+    half, full = (choose_route(precision, device, width).gflops for precision in ("bf16", "fp32"))
+    return "bf16" if half > full else "fp32"
+
+
+def _within_the_box(model: PriorModel) -> PriorModel:
+    """The same networks, whose density outside the box counts as zero (the paper, for the final rendering).
+
+    A prior that was trained between planes has a background of its own there, for the cameras that it was trained
+    with; seen by others it would stand before the head.
+    """
+    shown = copy.copy(model)
+    shown.config = model.config.within_the_box()
+    return shown
 
 
 def _whole(
@@ -265,34 +304,10 @@ class ShortRenderer:
 
 def _changed(model: PriorModel, shortcuts: Shortcuts) -> PriorModel:
     """A copy of a folded model with products of another precision, or without its highest levels."""
-    levels = min(shortcuts.levels or model.levels, model.levels)
-    config = dataclasses.replace(model.config, levels=levels, matmul=shortcuts.matmul or model.config.matmul)
-    changed = PriorModel(config, len(model.codes)).to(model.basis.device)
-    values = model.state_dict()
-    directions = model.basis.shape[1]
-    kept = torch.arange(2 * model.levels * directions) // directions % model.levels < levels
-    for name, network in (("proposal", model.proposal), ("nerf", model.nerf)):
-        assert isinstance(network, Trunk)
-        for key in _sees_encoding(network):
-            weight = values[f"{name}.{key}"]
-            features = weight.shape[1] - len(kept)
-            columns = torch.cat([torch.ones(features, dtype=torch.bool), kept]).to(weight.device)
-            values[f"{name}.{key}"] = weight[:, columns]
-    changed.load_state_dict(values)
-    changed.products = Products(config.matmul)
+    changed = with_levels(model, min(shortcuts.levels or model.levels, model.levels))
+    changed.config = dataclasses.replace(changed.config, matmul=shortcuts.matmul or model.config.matmul)
+    changed.products = Products(changed.config.matmul)
     return changed
-
-
-def _sees_encoding(network: Trunk) -> list[str]:
-    """The weights whose last inputs are the encoded position."""
-    names = ["layers.0.weight"]
-    if network.skip + 1 < len(network.layers):
-        names.append(f"layers.{network.skip + 1}.weight")
-    if network.features > network.width:
-        names += [
-            f"{head}.weight" for head in ("density", "bottleneck", "normals") if getattr(network, head, None)
-        ]
-    return names
 
 
 def _with_samples(config: ModelConfig, index: int, samples: int) -> ModelConfig:

@@ -31,20 +31,16 @@ class Space:
     Attributes:
         box: of the canonical frame, metres.
         scale: 1/metre; the model's lengths are metres times this.
-        planes: near and far depths in metres between which all rays are sampled, of a model that is not clipped
-            to the box; None where the box's faces are the ends.
     """
 
     box: Box
     scale: float
-    planes: tuple[float, float] | None = None
 
 
 def space_of(prior: Prior) -> Space:
     """Where a prior or a head lives."""
     scene = prior.scene
-    planes = None if prior.model.clip_to_box else scene.near_far
-    return Space(Box(scene.box[0], scene.box[1]), scene.scene_scale, planes)
+    return Space(Box(scene.box[0], scene.box[1]), scene.scene_scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +72,7 @@ def render_image(
     device: torch.device | str = "cpu",
     progress: Callable[[int], None] | None = None,
 ) -> RenderedImage:
-    """Render what a camera sees.
+    """Render what a camera sees of the box.
 
     Args:
         render: rays in scene units to what they see, such as `lambda rays: model(rays, code[None])`.
@@ -146,11 +142,7 @@ def _strip_rays(view: Views, space: Space, width: int, top: int, bottom: int) ->
             f"camera: its lens folds inside the image, so that pixel ({first[0]}, {first[1]}) has no ray; "
             "use a camera without distortion, or crop the image"
         )
-    if space.planes is None:
-        near, far, hit = space.box.intersect(cast.origins, cast.directions)
-    else:  # the depth of directions is one
-        near, far = (np.full(len(cast.origins), depth) for depth in space.planes)
-        hit = np.ones(len(cast.origins), bool)
+    near, far, hit = space.box.intersect(cast.origins, cast.directions)
     arrays = {
         "origins": cast.origins * space.scale,
         "directions": cast.directions,

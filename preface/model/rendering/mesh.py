@@ -22,6 +22,7 @@ from preface.artifacts import ArtifactError, write_bytes
 from preface.model import coord, volume
 from preface.model.model import PriorModel
 from preface.model.rendering.image import Space
+from preface.model.rendering.samples import encode_points
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
 SURFACE_DEPTH = 0.01  # metres over which opacity at the surface is meant
@@ -57,17 +58,15 @@ class Mesh:
 
 
 def model_field(model: PriorModel, code: Tensor | None, voxel: float) -> Field:
-    """The field of a model and a code [latent], for voxels of a side in scene units.
+    """The field of a model and a code [latent], None for one without codes, for voxels of a side in scene units.
 
     Positions are encoded as Gaussians with the variance of a voxel, side^2 / 12 along each axis.
     """
     one = None if code is None else code[None]
 
     def features(points: Tensor) -> tuple[Tensor, list[Tensor]]:
-        mean = (points[..., None] * model.basis).sum(dim=-2)  # not a product in low precision
-        var = torch.full_like(mean, voxel**2 / 12)
         biases = model.nerf.biases(one, None, 1)
-        encoded = coord.integrated_pos_enc(mean, var, 0, model.levels)
+        encoded = encode_points(points, voxel**2 / 12, model.basis, model.levels)
         return model.nerf.trunk(encoded, biases, model.products), biases
 
     def density(points: Tensor) -> Tensor:
@@ -155,10 +154,16 @@ def _sampled(
     out = np.empty((nz, ny * nx), np.float32)
     for level in range(nz):
         z = torch.full((len(layer), 1), first[2] + level * side, dtype=torch.float64)
-        points = torch.cat([layer, z], dim=1).float().to(device)
-        parts = [field.density(part) for part in points.split(SLAB_POINTS)]
-        out[level] = torch.cat(parts).cpu().numpy()
+        out[level] = _in_slabs(field.density, torch.cat([layer, z], dim=1), device=device).numpy()
     return out.reshape(nz, ny, nx)
+
+
+def _in_slabs(
+    evaluate: Callable[..., Tensor], *points: Tensor | np.ndarray, device: torch.device | str
+) -> Tensor:
+    """A function of points and what belongs to them, each [n, 3], some at a time; on the CPU."""
+    slabs = zip(*(torch.as_tensor(values).float().split(SLAB_POINTS) for values in points), strict=True)
+    return torch.cat([evaluate(*(part.to(device) for part in slab)).cpu() for slab in slabs])
 
 
 def _keep_largest(mesh: object) -> None:
@@ -173,10 +178,7 @@ def _outwards(
 ) -> np.ndarray:
     """Turn all triangles round if more of them face what is dense than what is empty."""
     step = _normals(vertices, triangles) * side
-    ahead, behind = (
-        field.density(torch.from_numpy((vertices + sign * step).astype(np.float32)).to(device)).cpu()
-        for sign in (1, -1)
-    )
+    ahead, behind = (_in_slabs(field.density, vertices + sign * step, device=device) for sign in (1, -1))
     return triangles[:, ::-1].copy() if bool((ahead > behind).double().mean() > 0.5) else triangles
 
 
@@ -195,8 +197,5 @@ def _colored(
     field: Field, vertices: np.ndarray, normals: np.ndarray, device: torch.device | str
 ) -> np.ndarray:
     """Colours of vertices as seen straight on."""
-    points = torch.from_numpy(vertices.astype(np.float32)).to(device)
-    directions = torch.from_numpy(-normals.astype(np.float32)).to(device)
-    pairs = zip(points.split(SLAB_POINTS), directions.split(SLAB_POINTS), strict=True)
-    colors = torch.cat([field.color(*pair) for pair in pairs]).cpu().double().numpy()
-    return np.clip(colors, 0, 1)
+    colors = _in_slabs(field.color, vertices, -normals, device=device)
+    return np.clip(colors.double().numpy(), 0, 1)

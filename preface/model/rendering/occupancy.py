@@ -24,11 +24,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool3d, pad
 
-from preface.model import volume
-from preface.model.model import PriorModel
 from preface.model.rays import Rays
 from preface.model.rendering.image import Space
-from preface.model.rendering.samples import encode_points
 
 POINTS = 4096  # positions that are evaluated together
 
@@ -103,7 +100,7 @@ def learn_occupancy(
     """Evaluate a density at the corners of cubes over a box.
 
     Args:
-        density: of a head; see `model_density`.
+        density: of a head, as cubes of that side see it (`preface.model.rendering.mesh.model_field`).
         space: of the model.
         cubes: along the box's longest side.
         empty_alpha: see above, in [0, 1).
@@ -127,18 +124,6 @@ def learn_occupancy(
     widened = max_pool3d(seen[None].float(), 3, stride=1, padding=1)[0] > 0
     steps = math.ceil(float(np.linalg.norm(size)) / side)
     return Occupancy(first, side, steps, highest, lowest, widened)
-
-
-def model_density(model: PriorModel, side: float) -> Density:
-    """The density of a folded model as cubes of a side, in scene units, see it."""
-
-    def density(points: Tensor) -> Tensor:
-        biases = model.nerf.biases(None, None, 1)
-        encoded = encode_points(points, side**2 / 12, model.basis, model.levels)
-        features = model.nerf.trunk(encoded, biases, model.products)
-        return volume.density_from_raw(model.nerf.raw_density(features, biases[len(model.nerf.layers)]))
-
-    return density
 
 
 @torch.no_grad()

@@ -67,7 +67,8 @@ class Shortcuts:
     (median over views not fitted to), the density's by 21 to 26 (`tools/bench/head_truth.py`)."""
     matmul: Literal["", "fp32", "bf16"] = ""
     """Precision of products inside the networks; by default as trained. bf16: 0.71 of the time on a processor that
-    has such products, 68 dB to the render without."""
+    has such products, 68 dB to the render without; one that is not faster with them, which is tried once, takes
+    fp32."""
     levels: int = 0
     """Levels of the position's encoding that are kept, from the lowest; 0: all. Of 11, 10: 67.5 dB to the render
     with all; 9: 52.5 dB."""
@@ -142,7 +143,7 @@ def accelerate(
     Args:
         model: of the head, on the device where rays will be.
         code: [latent] of the head; None for a model without codes.
-        space: of the model.
+        space: of the model, the outside of whose box is empty, also where the model was trained beyond it.
         shortcuts: which.
         background: grey value behind the head.
         normals: whether rays are to find normals.

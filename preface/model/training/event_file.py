@@ -8,6 +8,7 @@ that `tensorboard` brings along. Look at a run with ``tensorboard --logdir prior
 
 from __future__ import annotations
 
+import math
 import struct
 import time
 from collections.abc import Mapping
@@ -21,6 +22,7 @@ from preface.artifacts import ArtifactError
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types of protocol buffers
 _START_OF_SESSION = 1  # SessionLog.START: readers drop what a killed run wrote from this step on
 _RGB = 3
+_LARGEST = (2 - 2**-23) * 2.0**127  # float32
 
 
 class EventFile:
@@ -52,8 +54,8 @@ class EventFile:
         self._file.close()
 
     def numbers(self, step: int, values: Mapping[str, float]) -> None:
-        """Write numbers of a step by name."""
-        entries = [_text(1, name) + _field(2, _FIXED32, struct.pack("<f", v)) for name, v in values.items()]
+        """Write numbers of a step by name, as float32: finite ones beyond its range, as its largest."""
+        entries = [_text(1, name) + _field(2, _FIXED32, _float32(value)) for name, value in values.items()]
         self._write(step, _message(5, b"".join(_message(1, entry) for entry in entries)))
 
     def picture(self, step: int, name: str, png: bytes, size: tuple[int, int]) -> None:
@@ -71,6 +73,11 @@ class EventFile:
             self._file.flush()
         except OSError as error:
             raise ArtifactError.from_os(self.path, "writing", error) from error
+
+
+def _float32(value: float) -> bytes:
+    finite = math.isfinite(value)
+    return struct.pack("<f", min(max(value, -_LARGEST), _LARGEST) if finite else value)
 
 
 def _masked_crc(data: bytes) -> bytes:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, cast
@@ -67,7 +67,8 @@ class Phase:
         steps: of the phase.
         pace: see there.
         remedy: what to do when a loss is not finite.
-        memory_remedy: what to do when memory runs out.
+        memory_remedy: what to do when memory runs out in a step.
+        look_remedy: what to do when it runs out in a look.
         kind: of the log's entries.
         title: in front of lines about steps.
         before: steps of the run before the phase, which the log counts too.
@@ -80,6 +81,7 @@ class Phase:
     pace: Pace
     remedy: str
     memory_remedy: str
+    look_remedy: str
     kind: str = "train"
     title: str = ""
     before: int = 0
@@ -159,7 +161,10 @@ def take_steps(
     def look(last: bool) -> None:
         """Look between two checkpoints: it may take long, and be interrupted."""
         save()
-        run.look(log, last)
+        where = f"{phase.title}what is learned so far could not be shown"
+        kept = f"the checkpoint in {run.output} has all steps so far"
+        with memory_explained(where, f"{kept}; {phase.look_remedy}"):
+            run.look(log, last)
         save()
         looked.restart()
 
@@ -194,19 +199,30 @@ def take_steps(
 
 def _step(run: Run, phase: Phase, step: int, batch: Batch) -> Outcome:
     """One step; what goes wrong says what is kept and what to do."""
+    rays = phase.trainer.options.micro_rays
+    how = f" with {rays} rays at a time"
     try:
-        return phase.trainer.step(step, batch)
+        with memory_explained(f"{phase.title}step {step}", phase.memory_remedy, how):
+            return phase.trainer.step(step, batch)
     except (NonFiniteError, ValueError) as error:  # ValueError: the model met a number that is none
         words = str(error) if isinstance(error, NonFiniteError) else f"step {step}: {error}"
         kept = f"the checkpoint in {run.output} is that of an earlier step"
         raise TrainingError(f"{phase.title}{words}; {kept}; {phase.remedy}") from error
+
+
+@contextlib.contextmanager
+def memory_explained(where: str, remedy: str, how: str = "") -> Iterator[None]:
+    """Say where and perhaps how memory ran out, if it does, and what to do.
+
+    Raises:
+        TrainingError: it did.
+    """
+    try:
+        yield
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
-        rays = phase.trainer.options.micro_rays
-        raise TrainingError(
-            f"{phase.title}step {step}: memory ran out with {rays} rays at a time; {phase.memory_remedy}"
-        ) from error
+        raise TrainingError(f"{where}: memory ran out{how}; {remedy}") from error
 
 
 def is_out_of_memory(error: BaseException) -> bool:

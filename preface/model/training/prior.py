@@ -57,6 +57,7 @@ def train_prior(config: TrainConfig, say: Say) -> Ended:
     except ValueError as error:
         raise TrainingConfigError(str(error)) from error
     with Dataset(config.shards) as dataset, joined_ranks(device) as ranks:
+        require_shares(config, ranks)
         data = open_data(dataset, config.training, config.model)
         speak = say if ranks.is_first else _silent
         if config.run.dry_run:
@@ -75,6 +76,21 @@ def train_prior(config: TrainConfig, say: Say) -> Ended:
 def _was_looked_at(prior: Prior) -> bool:
     """Whether a finished run's last figures are there, or cannot be."""
     return not prior.held_out or prior.validation.get("step") == prior.steps
+
+
+def require_shares(config: TrainConfig, ranks: Ranks) -> None:
+    """Refuse more processes than a step has views to share out.
+
+    Raises:
+        TrainingConfigError: saying what to change.
+    """
+    training = config.training
+    views = training.identities * training.views
+    if views < ranks.world:
+        raise TrainingConfigError(
+            f"--identities {training.identities} --views {training.views}: the {views} views of a step cannot be "
+            f"shared out among {ranks.world} processes; give more of either, or start {views} processes at most"
+        )
 
 
 def _silent(words: str) -> None:
@@ -198,6 +214,9 @@ class _Run:
 
     def _phase(self) -> Phase:
         run, steps = self.config.run, self.config.training.steps
+        less = (
+            f"run again with --micro-rays {max(run.micro_rays // 2, 1)}, which changes nothing but the time"
+        )
         every = run.validate_every or max(steps // _SHARE_OF_RUN, 1)
         return Phase(
             self.trainer,
@@ -206,8 +225,8 @@ class _Run:
             steps,
             Pace(run.log_every, every, run.validate_minutes, run.checkpoint_minutes),
             "train into another --output with a lower --rate, a --warmup or a smaller --clip",
-            f"run again with --micro-rays {max(run.micro_rays // 2, 1)}, which changes nothing but the time, or "
-            "with a smaller model",
+            f"{less}, or train a smaller model into another --output",
+            less,
         )
 
     def taken(self, done: int, outcome: Outcome) -> None:

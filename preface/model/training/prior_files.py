@@ -137,6 +137,8 @@ def read_prior(path: str | os.PathLike[str]) -> Prior:
             installation that is without it.
     """
     path = prior_path(path)
+    if path.is_file() and path.suffix != ".json":
+        raise ArtifactError(path, "prior", "is not a prior", "Name the folder that preface-train wrote")
     path = path / MODEL_FILE if path.is_dir() else path
     content = read_artifact(path, SCHEMA)
     if content["architecture"] != ARCHITECTURE:

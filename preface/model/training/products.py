@@ -10,6 +10,7 @@ import torch
 
 from preface.model.configuration import ModelConfig
 from preface.model.matmul import FP32_ERROR, Route, choose_route
+from preface.model.training.configuration import TrainingConfigError
 
 
 @contextlib.contextmanager
@@ -21,6 +22,9 @@ def chosen_products(model: ModelConfig, before: str, wanted: str, device: torch.
         before: the route of the steps before; empty if there were none.
         wanted: `auto` or the name of a route.
         device: where.
+
+    Raises:
+        TrainingConfigError: the route wanted is not exact on this processor.
     """
     fastest = choose_route(model.matmul, device, model.nerf.width)
     named = device.type == "cpu" and model.matmul == "fp32"
@@ -28,10 +32,13 @@ def chosen_products(model: ModelConfig, before: str, wanted: str, device: torch.
     route = replace(fastest, name=name or fastest.name)
     route.apply()
     try:
-        if (
-            wanted == "auto" and route.name != fastest.name and not _is_exact()
-        ):  # it has moved to another machine
-            route = fastest
+        if route.name != fastest.name and not _is_exact():
+            if wanted != "auto":
+                raise TrainingConfigError(
+                    f"--products {wanted}: multiplies float32 matrices in bfloat16 on this processor; give "
+                    "--products auto"
+                )
+            route = fastest  # the run has moved to another machine
             route.apply()
         yield route
     finally:

@@ -84,5 +84,16 @@ def device_of_rank(wanted: str) -> torch.device:
             raise ValueError("--device cuda: this PyTorch sees no CUDA device; use --device cpu")
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
         torch.cuda.set_device(device)
+        forbid_tf32()
         return device
     return torch.device(name)
+
+
+def forbid_tf32() -> None:
+    """Make CUDA compute float32 products and convolutions in float32, not in TF32 with its ten bits.
+
+    PyTorch allows TF32 to convolutions unless told otherwise. LPIPS is made of those: its figures, and the loss of
+    inversion, would be others than on a CPU and than the reference's.
+    """
+    torch.backends.cudnn.allow_tf32 = False
+    torch.backends.cuda.matmul.allow_tf32 = False

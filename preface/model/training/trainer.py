@@ -2,7 +2,9 @@
 
 They differ in what is handed over: which parameters are trained at which rate (`ParameterSet`), what is asked of
 the rendered rays (`LossTerm`), and how rays are rendered. Everything random is a function of (seed, step), so that
-a step needs its number, the parameters and Adam's moments, and nothing else.
+a step needs its number, the parameters and Adam's moments, and nothing else. On a CPU, with as many threads, a
+step taken again is the same bit for bit. On CUDA it is the same to rounding: gradients of rows that are picked out
+(codes of identities, rays that meet the box, edges of intervals) are added up there in whatever order they come.
 
     trainer = Trainer(sets, terms, render, Options(), sampler.groups)
     for step, batch in loader.batches(start, stop):

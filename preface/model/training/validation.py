@@ -1,6 +1,8 @@
 """Looking at a prior: whole views rendered and measured, and faces between faces.
 
-Figures and pictures are of the model without jitter, hence repeatable.
+Figures and pictures are of the model without jitter, hence repeatable, and as it is trained: one that models the
+background is rendered with it, between the planes of the view, and held against photographs as they are. Rendering
+and evaluation leave the background out (`preface.model.rendering.accelerated`).
 """
 
 from __future__ import annotations
@@ -14,9 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from preface.model.evaluation.options import LARGEST_PSNR
 from preface.model.metrics.image_quality import psnr
 from preface.model.model import PriorModel
 from preface.model.rendering.image import SEEN
+from preface.model.rendering.showing import ERROR_SHOWN, error_picture, tile_size
 from preface.model.training.data import TrainingData, WholeViews, frontal_view
 from preface.model.training.prior_loss import rays_of, target_colors
 from preface.model.training.trainer import slice_batch
@@ -25,8 +29,6 @@ from preface.shards import Batch, Loader
 
 MAX_ROWS = 12  # of a sheet of views; more is no longer looked at
 STEPS_BETWEEN = 7  # faces per row of an interpolation, both ends included
-ERROR_SHOWN = 0.25  # the mean absolute error, of 1, at the bright end of the error map
-_BEST_PSNR = 100.0  # dB, in place of infinity
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,10 +124,10 @@ class Viewer:
 
 
 def _psnr(rgb: np.ndarray, truth: np.ndarray, mask: Tensor) -> float:
-    """In dB, at most 100, so that it can be averaged and written; NaN where no pixel counts."""
+    """In dB, at most `LARGEST_PSNR`, so that it can be averaged and written; NaN where no pixel counts."""
     if not bool(mask.any()):
         return math.nan
-    return min(psnr(torch.from_numpy(rgb), torch.from_numpy(truth), mask), _BEST_PSNR)
+    return min(psnr(torch.from_numpy(rgb), torch.from_numpy(truth), mask), LARGEST_PSNR)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,11 +159,10 @@ def view_sheet(views: Sequence[ViewImages], box_depths: tuple[float, float]) -> 
     height, width = views[0].depth.shape
     tiles = []
     for view in views:
-        error = np.abs(view.rgb - view.truth).mean(axis=-1)
         tiles += [
             (as_picture(view.truth), view.name),
             (as_picture(view.rgb), f"{view.psnr:.2f} dB"),
-            (colorize(error, 0, ERROR_SHOWN, "inferno"), f"error to {ERROR_SHOWN}"),
+            (error_picture(view.rgb, view.truth), f"error, 0 to {ERROR_SHOWN}"),
             (colorize(view.depth, *box_depths, "viridis"), "depth"),
         ]
     return contact_sheet(tiles, 4, tile_size(width, height))
@@ -175,12 +176,6 @@ def interpolation_sheet(rows: Sequence[Sequence[np.ndarray]], names: Sequence[tu
         captions = [one, *[f"{share:.2f}" for share in np.linspace(0, 1, len(row))[1:-1]], other]
         tiles += [(as_picture(picture), words) for picture, words in zip(row, captions, strict=True)]
     return contact_sheet(tiles, len(rows[0]), tile_size(width, height))
-
-
-def tile_size(width: int, height: int) -> tuple[int, int]:
-    """Whole pixels, and some 200 of them at least."""
-    factor = max(1, 200 // height)
-    return width * factor, height * factor
 
 
 def as_png(picture: Picture) -> bytes:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from preface.plain_words import counted, disk_space
 from preface.shards.dataset.configuration import BuildConfiguration
 from preface.shards.dataset.people import LeftOut, Person
 from preface.shards.dataset.tasks import TaskResult
@@ -134,9 +135,10 @@ def data_card(contents: Contents, left_out: Sequence[LeftOut], pages: Mapping[st
         "",
         f"# {contents.name}",
         "",
-        f"{len(contents.entries)} heads in {contents.views} posed views of {chosen.width}x{chosen.height} pixels, "
-        f"{len(contents.files)} shards, {contents.bytes / 1e9:.3g} GB. Made by `preface-build-shards`; the format is "
-        "described in `data_specs/shards.md` of preface.",
+        f"{counted(len(contents.entries), 'head', 'heads')} in {counted(contents.views, 'posed view', 'posed views')} "
+        f"of {chosen.width}x{chosen.height} pixels, {counted(len(contents.files), 'shard', 'shards')}, "
+        f"{disk_space(contents.bytes)}. Made by `preface-build-shards`; the format is described in "
+        "`data_specs/shards.md` of preface.",
         "",
         "The pictures show people. Whoever passes this dataset on answers for their consent and for the terms of the "
         "capture that it was made from; nothing in this folder grants a licence.",

@@ -7,6 +7,8 @@ import pytest
 from people import Shoot, shoot
 
 from preface.align.photos import PhotoAlignment, PhotoOptions, align_photos
+from preface.align.photos.trust import SCALE
+from preface.align.photos.views import HARDLY, rests_on
 from preface.geometry import fit_similarity
 from preface.geometry.transforms import Rigid
 
@@ -62,7 +64,7 @@ def test_the_frame_is_the_faces_own(three):
 
 def test_the_size_of_the_face_is_stated_with_a_deviation_that_covers_the_truth(three):
     truth, found = three
-    scale = next(said for said in found.trust if said.what == "scale")
+    scale = next(said for said in found.trust if said.what == SCALE)
     assert scale.source == "expectation"
     assert abs(scale.value / 1e3 - truth.eyes) < 3 * scale.deviation / 1e3
 
@@ -83,6 +85,7 @@ def test_one_photograph_still_yields_a_camera_and_says_what_it_does_not_know():
     distance = next(said for said in found.trust if said.what == "distance of photo0")
     assert focal.source == "expectation"
     assert distance.deviation / distance.value > 0.1
+    assert distance.rests_on == HARDLY
     wrong = found.rig.cameras["photo0"].camera_from_rig.rotation.T @ truth.poses[0].rotation
     assert angle(wrong) < 6.0
 
@@ -93,7 +96,23 @@ def test_exif_makes_focal_length_and_distance_known():
     focal = next(said for said in found.trust if said.what == "focal length")
     assert focal.source == "exif"
     assert focal.deviation / focal.value < 0.051
+    distance = next(said for said in found.trust if said.what == "distance of photo0")
+    assert distance.rests_on == "photographs"
     assert abs(focal.value / (0.8 * 1600) - 1) < 0.15
+
+
+@pytest.mark.parametrize(
+    ("source", "value", "deviation", "expected"),
+    [
+        ("photographs", -500.0, 51.0, HARDLY),
+        ("photographs", -500.0, 49.0, "photographs"),
+        ("photographs", None, 2.0, "photographs"),
+        ("photographs", None, None, "photographs"),
+        ("expectation", 500.0, 400.0, "expectation"),
+    ],
+)
+def test_a_loose_number_hardly_rests_on_the_photographs(source, value, deviation, expected):
+    assert rests_on(source, value, deviation) == expected
 
 
 @pytest.mark.parametrize("exif", [40.0, 18_000.0])
@@ -110,7 +129,7 @@ def test_a_known_distance_of_keypoints_sets_the_scale():
     known = ("right_eye_outer", "left_eye_outer", truth.eyes)
     found = align_photos(truth.views, options=PhotoOptions(known_distance=known))
     assert np.linalg.norm(found.keypoints[0] - found.keypoints[1]) == pytest.approx(truth.eyes, rel=1e-9)
-    scale = next(said for said in found.trust if said.what == "scale")
+    scale = next(said for said in found.trust if said.what == SCALE)
     assert scale.source == "given"
     assert scale.deviation == pytest.approx(1.0, rel=0.05)  # the millimetre of the distance itself
 

@@ -15,6 +15,7 @@ from preface.align.photos.face import face_prior
 from preface.align.photos.initial import ViewProblemError, first_pose
 from preface.align.photos.noise import Observations
 from preface.align.photos.projection import Scene, linearise, project
+from preface.align.photos.trust import SCALE
 from preface.capture.rig import Rig, RigCamera
 from preface.geometry import fit_similarity
 
@@ -159,7 +160,7 @@ def test_given_cameras_of_arbitrary_unit_get_their_scale_from_the_face():
     truth = shoot((-20, 0, 20), seed=11)
     found = align_photos(truth.views, rig_of(truth, unit=37.0))
     assert errors(found, truth).max() < 0.03
-    scale = next(said for said in found.trust if said.what == "scale")
+    scale = next(said for said in found.trust if said.what == SCALE)
     assert abs(scale.value / 1e3 - truth.eyes) < 3 * scale.deviation / 1e3
 
 

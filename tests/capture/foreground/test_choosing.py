@@ -44,7 +44,7 @@ ROOM = np.full((60, 40, 3), 0.3)
     ("declared", "behind", "masks", "plates", "method", "words"),
     [
         ("green", screen(60, 40, 0.1), CAMERAS, (), "given", "all 2 photographs have a mask"),
-        ("black", BLACK, (), (), "black", "says that its background is black"),
+        ("black", BLACK, (), (), "black", "monday says that its background is black"),
         ("green", screen(60, 40, 0.1), (), CAMERAS, "green", "says that its background is green"),
         ("unknown", ROOM, (), CAMERAS, "plate", "clean plates of all 2 cameras"),
         ("unknown", BLACK, (), (), "black", "the border of 2 of 2 photographs looked at is black"),

@@ -21,6 +21,12 @@ def test_contradictions_come_first_then_remarks_then_the_unusual():
     assert ordered[:5] == [flagged, remark, off, unusual, soft]
 
 
+def test_masks_that_nothing_else_tells_apart_come_by_what_their_captions_say():
+    known = [figures(disagreement=share, soft=0.1 * (1 - share)) for share in (0.16, 0.18, 0.11, 0.07, 0.12)]
+    ordered = worst_first([*known, figures(share=0.9)])
+    assert [one.disagreement for one in ordered[:5]] == [0.18, 0.16, 0.12, 0.11, 0.07]
+
+
 def test_the_report_shows_the_worst_and_loads_no_more_than_it_shows(tmp_path):
     alpha, light = person()
     pixels = photograph(alpha, light, screen(240, 160, 0.1))
@@ -38,6 +44,11 @@ def test_the_report_shows_the_worst_and_loads_no_more_than_it_shows(tmp_path):
     assert len(loaded) == 36
     twin = json.loads(path.with_suffix(".json").read_text())
     assert twin["title"] == "Foreground of 50 photographs"
+    tiles = {figure["name"]: figure for figure in twin["sections"][0]["blocks"][0]["figures"]}
+    assert tiles["Off the hull, median"]["value"] == pytest.approx(24.5)
+    assert tiles["Off the hull, median"]["unit"] == "%"
+    rows = twin["sections"][1]["blocks"][-1]["rows"]
+    assert [round(row["off the hull"]) for row in rows[:3]] == [3, 49, 48]
     assert "green: the take says so" in path.read_text()
     assert "cam03" in path.read_text()
 

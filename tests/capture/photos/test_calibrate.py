@@ -239,8 +239,10 @@ def test_photographs_that_have_nothing_in_common_are_refused(tmp_path):
 def test_one_camera_has_one_size_but_two_may_differ(tmp_path):
     for name, size in {"a": (60, 80), "b": (60, 80), "c": (80, 60)}.items():
         write_png(tmp_path / f"{name}.png", noise(0, (*size, 1)))
-    with pytest.raises(PhotoError, match=r"c\.png: size: is 60x80.*are 80x60"):
+    with pytest.raises(PhotoError, match=r"c\.png: size: is 60x80.*are 80x60.*--cameras each"):
         calibrate_photos(tmp_path)
+    with pytest.raises(PhotoError, match=r"Give photographs of one size and orientation\.?$"):
+        find_photographs(tmp_path, None)
     assert [photo.camera for photo in find_photographs(tmp_path, "each")] == [0, 1, 2]
 
 

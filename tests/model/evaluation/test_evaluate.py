@@ -1,8 +1,10 @@
 """A head evaluated against photographs that are known in closed form, with a renderer that is known as well."""
 
+import ball_heads
 import numpy as np
 import pytest
 import torch
+import untrained
 
 from preface.artifacts import ArtifactError
 from preface.model.evaluation import evaluate
@@ -16,8 +18,6 @@ OPTIONS = EvaluationOptions(lpips="none")
 
 def analytic_ball(number: int, offset=(0.0, 0.0, 0.0), scale=1 / 0.15):
     """Renders the ball of `ball_heads` of a number by ray casting in float64, moved by an offset in metres."""
-    import ball_heads
-
     radius = 0.1 + 0.008 * (number % 4)
 
     def render(rays) -> Render:
@@ -113,9 +113,25 @@ def test_what_floats_beside_the_head_counts_against_it(prior, dataset, rendered_
     assert dirty["psnr_foreground"] == clean["psnr_foreground"]
 
 
-def test_the_angle_to_the_nearest_photograph_that_was_seen(head, dataset):
-    import ball_heads
+@pytest.mark.parametrize("quality", ["reference", "balanced"])
+def test_a_prior_with_a_background_of_its_own_is_evaluated_within_the_box(tmp_path, dataset, quality):
+    """As the paper renders it: nothing is shown outside the box, and what is within is masked as the photograph is."""
+    options, names = EvaluationOptions(lpips="none", quality=quality), ["id0001"]
+    open_ = {"clip_to_box": False, "background": "modelled"}
+    folders = [
+        untrained.write_model(tmp_path / name, names, {"id0001": ("camera2",)}, **model)
+        for name, model in (("clipped", {}), ("open", open_))
+    ]
+    clipped, found = (
+        evaluate_head(read_prior(folder), dataset, "id0001", None, options) for folder in folders
+    )
+    view = clipped.views[0]
+    np.testing.assert_array_equal(found.views[0].rgb, view.rgb * view.mask[..., None])
+    assert view.rgb[view.mask == 0].max() > 0
+    assert found.mean["silhouette_iou"] == clipped.mean["silhouette_iou"]
 
+
+def test_the_angle_to_the_nearest_photograph_that_was_seen(head, dataset):
     names = ["camera0", "camera2"]
     found = evaluate_head(read_prior(head("a", names)), dataset, "id0000", ["camera1", "camera2"], OPTIONS)
     centers = [pose.translation / np.linalg.norm(pose.translation) for pose in ball_heads.poses()]

@@ -47,7 +47,7 @@ def test_the_layer_for_normals_is_added_without_changing_what_is_seen(prior, hea
 def values_of(terms, model, data):
     """The terms of a grid of rays, with their graphs."""
     batch = grids(data, 8)[0]
-    seen = model(Rays.from_batch(batch), code_of(model))
+    seen = model(Rays.from_batch(batch), code_of(model), normals=True)
     return {term.name: (term.weight, term.value(seen, Part(0, batch, 0, 1))) for term in terms}
 
 
@@ -70,6 +70,38 @@ def test_opacity_is_held_against_the_mask_where_it_is_asked_for(head, data):
     np.testing.assert_allclose(
         float(value.detach()), np.abs(seen.acc.detach().numpy() - mask).mean(), rtol=1e-5
     )
+
+
+@pytest.mark.parametrize("normals", [0.0, 1e-3], ids=["alone", "beside predicted normals"])
+def test_normals_that_face_away_are_penalised_where_it_is_asked_for(prior, data, correction, normals):
+    """By the directions that are rendered, those of corrected cameras, as a mean over all rays."""
+    networks = read_prior(prior).load_model()
+    head = head_of_prior(networks, networks.codes.detach().mean(dim=0))
+    head = with_predicted_normals(head, 0) if normals else head
+    with torch.no_grad():
+        correction.cameras.rotation[:, 1] = 0.2
+    asked = replace(small_fits.FINETUNING, rays=96, orientation=0.1, normals=normals)
+    trainer, loader = finetuning_trainer(
+        head, asked, 4, data, 0, 32, CPU, knows_heads=True, correction=correction
+    )
+    batch = loader.batch(0)
+    (term,) = [one for one in trainer.terms if one.name == "orientation"]
+    part = Part(0, batch, 0, 1)
+    seen = trainer.render(part)
+    value = term.value(seen, part)
+    rays = correction.apply(Rays.from_batch(batch), batch.view)
+    hit = rays.hit[:, 0].numpy()
+    assert 0 < hit.sum() < len(hit)
+    weights, found, ahead = (
+        x.detach().double().numpy()
+        for x in (seen.levels[-1].weights, seen.normals, rays.viewdirs[rays.hit[:, 0]])
+    )
+    away = np.maximum((found * ahead[:, None]).sum(axis=-1), 0)
+    assert term.weight == 0.1
+    assert float(value.detach()) == pytest.approx((weights * away**2).sum() / len(hit), rel=1e-5)
+    (gradient,) = torch.autograd.grad(value, head.nerf.layers[0].weight)
+    assert gradient.any()
+    assert trainer.step(0, batch).terms["orientation"] > 0
 
 
 def test_the_view_penalty_is_on_the_columns_of_the_direction_alone(head, data):

@@ -15,8 +15,10 @@ from small_runs import assert_equal_bits, quiet, tensors, words_of_log
 
 from preface.artifacts import ArtifactError, provenance, read_artifact
 from preface.model.configuration import PRESETS
+from preface.model.fitting import beginning as beginning_module
 from preface.model.fitting import run as run_module
 from preface.model.fitting.heads import head_of_prior
+from preface.model.fitting.previews import Previewer
 from preface.model.fitting.run import fit_head
 from preface.model.training.configuration import TrainingConfigError
 from preface.model.training.lock import only_run
@@ -48,12 +50,15 @@ def test_a_prior_helps_views_that_were_not_fitted_to(balls, prior, tmp_path):
     assert found[0] > found[1] + 3
 
 
-def test_the_baseline_may_have_the_architecture_of_a_prior(balls, prior, tmp_path):
+def test_the_baseline_may_have_the_architecture_of_a_prior(balls, prior, straight, tmp_path):
     """Everything but the code and what was learned; --model is then of no account."""
     given = config(balls, "none", tmp_path / "a", model=PRESETS["small"], like=prior)
     assert fit_head(given, quiet).status == fit_head(given, quiet).status == 0
     head, like = read_prior(tmp_path / "a"), read_prior(prior)
     assert head.model == replace(like.model, latent=0, predicted_normals=True)
+    assert (
+        head.model.levels == read_prior(straight).model.levels
+    )  # as many as a fit from that prior ends with
     assert head.fit["prior"] is None
     refused(replace(given, like=None), r"model\.")
 
@@ -238,7 +243,9 @@ def test_a_frozen_code_is_the_one_that_inversion_found(balls, prior, tmp_path):
 def test_finer_views_are_inverted_at_the_priors_resolution(balls, prior, tmp_path, monkeypatch):
     """By a prior that says that its images were half as large."""
     coarse = replace(read_prior(prior), scene=replace(read_prior(prior).scene, resolution=(12, 16)))
-    monkeypatch.setattr(run_module, "read_prior", lambda path: coarse if path == prior else read_prior(path))
+    monkeypatch.setattr(
+        beginning_module, "read_prior", lambda path: coarse if path == prior else read_prior(path)
+    )
     sizes = []
     trainer = run_module.inversion_trainer
 
@@ -279,7 +286,9 @@ def test_a_head_is_no_prior(balls, straight, tmp_path):
 
 def test_a_prior_that_is_not_finished_is_used_with_a_warning(balls, prior, tmp_path, monkeypatch):
     half = replace(read_prior(prior), step=3)
-    monkeypatch.setattr(run_module, "read_prior", lambda path: half if path == prior else read_prior(path))
+    monkeypatch.setattr(
+        beginning_module, "read_prior", lambda path: half if path == prior else read_prior(path)
+    )
     said = []
     steps = {"inversion": {"steps": 0}, "finetuning": {"steps": 0}}
     assert fit_head(config(balls, prior, tmp_path / "a", **steps), said.append).status == 0
@@ -342,3 +351,20 @@ def test_memory_that_runs_out_says_what_to_lower(balls, prior, tmp_path, monkeyp
     )
     none = config(balls, "none", tmp_path / "b")
     refused(none, r"finetuning: step 0: memory.*--micro-rays 256", TrainingError)
+
+
+@pytest.mark.parametrize("steps", [4, 0], ids=["of a phase", "without any step"])
+def test_memory_that_runs_out_in_a_preview_says_what_to_lower(balls, prior, tmp_path, monkeypatch, steps):
+    def out_of_memory(self):
+        raise MemoryError
+
+    few = {"inversion": {"steps": steps, "lpips": 0.0}, "finetuning": {"steps": steps}}
+    with monkeypatch.context() as patched:
+        patched.setattr(Previewer, "sheet", out_of_memory)
+        refused(
+            config(balls, prior, tmp_path / "a", **few), r"memory ran out.*--micro-rays 256", TrainingError
+        )
+    assert read_prior(tmp_path / "a").step == steps
+    less = config(balls, prior, tmp_path / "a", run={"micro_rays": 256}, **few)
+    assert fit_head(less, quiet).status == 0
+    assert read_prior(tmp_path / "a").finished

@@ -8,7 +8,7 @@ import pytest
 
 from preface.artifacts import ArtifactError, provenance
 from preface.geometry import Rigid
-from preface.model.fitting.observations import PixelGrids, fitted_views, grids, observe
+from preface.model.fitting.observations import PixelGrids, grids, observe, view_numbers
 from preface.model.training.prior_files import read_prior
 from preface.shards import Dataset
 from preface.shards.building import build_manifest
@@ -35,7 +35,7 @@ def test_views_are_those_named_in_their_order_and_the_others_are_held_out(balls)
         data = observe(dataset, "id0001", ("camera4", "camera2"), None)
         assert data.names == ("id0001",)
         assert data.train.pairs.tolist() == [[1, 2], [1, 4]]
-        assert fitted_views(data, ("camera4", "camera2")).tolist() == [[1, 4], [1, 2]]
+        assert view_numbers(data, ("camera4", "camera2")).tolist() == [[1, 4], [1, 2]]
         assert data.held_out_names == {"id0001": ("camera0", "camera1", "camera3", "camera5")}
         np.testing.assert_array_equal(data.scene.box, ball_heads.BOX)
         assert data.scene.resolution == (ball_heads.WIDTH, ball_heads.HEIGHT)

@@ -1,7 +1,5 @@
 """Images of scenes whose every pixel is known: an opaque ball, and a model cut into strips of any size."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -9,7 +7,6 @@ import torch
 from preface.geometry import Box, Camera, GeometryError, Rigid
 from preface.model.configuration import ModelConfig, NetworkConfig
 from preface.model.model import Level, PriorModel, Render
-from preface.model.rays import Rays
 from preface.model.rendering.image import Space, render_image
 from preface.model.rendering.paths import framing_camera, look_at
 
@@ -114,24 +111,3 @@ def test_a_lens_that_folds_inside_the_image_is_refused(pose):
     folding = Camera("SIMPLE_RADIAL", 20, 20, [8.0, 10.0, 10.0, -0.5])
     with pytest.raises(GeometryError, match="folds inside the image"):
         render_image(ball, SPACE, folding, pose, rays_at_a_time=64)
-
-
-def test_a_model_that_is_not_clipped_is_sampled_between_planes_wherever_the_box_is(pose):
-    """Rays that miss the box see what a prior with a modelled background has put there."""
-    model = small_model()
-    model.config = dataclasses.replace(model.config, clip_to_box=False, background="modelled")
-    camera = framing_camera(SPACE.box.half_sides, 0.95, 8, 12)
-    seen: list[Rays] = []
-
-    def render(rays):
-        seen.append(rays)
-        with torch.no_grad():
-            return model(rays, model.codes[:1])
-
-    image = render_image(
-        render, dataclasses.replace(SPACE, planes=(0.5, 1.5)), camera, pose, rays_at_a_time=96
-    )
-    assert bool(seen[0].hit.all())
-    ends = torch.cat([seen[0].near, seen[0].far], dim=1)
-    torch.testing.assert_close(ends, torch.tensor([[0.5, 1.5]]).expand(96, 2) * SPACE.scale)
-    assert (image.alpha > 0).all()

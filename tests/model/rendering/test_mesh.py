@@ -9,6 +9,7 @@ from preface.artifacts import ArtifactError
 from preface.geometry import Box
 from preface.model.configuration import ModelConfig, NetworkConfig
 from preface.model.model import PriorModel
+from preface.model.rendering import mesh as mesh_module
 from preface.model.rendering.image import Space
 from preface.model.rendering.mesh import Field, extract_mesh, model_field, write_mesh
 
@@ -49,6 +50,25 @@ def test_a_ball_has_its_radius_closed_and_facing_outwards(steepness):
     )  # positive if facing outwards
     # Colours are those seen straight on: direction of view against the normal.
     np.testing.assert_allclose(mesh.colors, (1 + offset / RADIUS) / 2, atol=0.05)
+
+
+def test_no_more_points_are_evaluated_together_than_memory_was_meant_for(monkeypatch):
+    whole, field, together = extract_mesh(ball(100.0), SPACE, 32), ball(100.0), []
+
+    def noted(evaluate):
+        def call(*points):
+            together.append(len(points[0]))
+            return evaluate(*points)
+
+        return call
+
+    monkeypatch.setattr(mesh_module, "SLAB_POINTS", 300)
+    parts = extract_mesh(Field(noted(field.density), noted(field.color)), SPACE, 32)
+    assert len(whole.vertices) > 600
+    assert max(together) == 300
+    np.testing.assert_array_equal(parts.triangles, whole.triangles)
+    np.testing.assert_array_equal(parts.vertices, whole.vertices)
+    np.testing.assert_array_equal(parts.colors, whole.colors)
 
 
 def test_what_floats_apart_is_left_out():

@@ -10,8 +10,10 @@ from preface.geometry import Box, Camera, Rigid
 from preface.model.configuration import ModelConfig, NetworkConfig
 from preface.model.coord import integrated_pos_enc
 from preface.model.folded import fold
+from preface.model.matmul import Route
 from preface.model.metrics.image_quality import psnr
 from preface.model.model import PriorModel
+from preface.model.rendering import accelerated
 from preface.model.rendering.image import RenderedImage, Space, render_image
 from preface.model.rendering.paths import framing_camera, look_at
 from preface.model.rendering.shortcuts import QUALITIES, Shortcuts, accelerate
@@ -148,6 +150,66 @@ def test_an_empty_and_a_solid_model(ball, bias, alpha):
     assert image.alpha.max() == pytest.approx(alpha)
     np.testing.assert_allclose(image.rgb[full.alpha == 0], 0.25)
     assert np.isfinite(image.rgb).all()
+
+
+@pytest.mark.parametrize("quality", list(QUALITIES))
+@pytest.mark.parametrize("center", [(0.3, 0.15, 0.9), (0.0, 0.1, 0.5), (-0.8, 0.3, 1.2)])
+def test_what_a_model_has_put_outside_the_box_is_not_there_wherever_the_camera_is(ball, quality, center):
+    """A prior with a modelled background: here a fog that fills the space, with the box cut out of it."""
+    clipped = PriorModel(ball.config, 2)
+    clipped.load_state_dict(ball.state_dict())
+    with torch.no_grad():
+        for network in (clipped.proposal, clipped.nerf):
+            network.density.bias.add_(40.0)
+    open_ = PriorModel(dataclasses.replace(ball.config, clip_to_box=False, background="modelled"), 2)
+    open_.load_state_dict(clipped.state_dict())
+    pose, camera = look_at(np.array(center), np.zeros(3)), Camera("PINHOLE", 12, 16, [7.0, 7.0, 6.0, 8.0])
+    one, other = (seen(model, QUALITIES[quality], pose, camera, background=0.5) for model in (clipped, open_))
+    beside = other.alpha == 0
+    assert 0.05 < beside.mean() < 1
+    assert (other.rgb[beside] == 0.5).all()
+    np.testing.assert_allclose(other.rgb, one.rgb, atol=1e-6)
+    assert (open_.config.clip_to_box, open_.config.background) == (False, "modelled"), "and stays as it was"
+
+
+@pytest.fixture
+def processor(monkeypatch):
+    """A function that puts a processor of certain speeds in the place of this one; it returns what was tried on it."""
+
+    def replace(bf16: float, fp32: float) -> list[str]:
+        tried = []
+
+        def choose_route(precision, device, width):
+            tried.append(precision)
+            return Route(precision, bf16 if precision == "bf16" else fp32, 0.0)
+
+        monkeypatch.setattr(accelerated, "choose_route", choose_route)
+        accelerated._fastest_precision.cache_clear()
+        return tried
+
+    yield replace
+    accelerated._fastest_precision.cache_clear()
+
+
+@pytest.mark.parametrize("quality", ["draft", "balanced"])
+def test_bfloat16_is_left_to_processors_that_are_faster_with_it(ball, processor, quality):
+    half = QUALITIES[quality]
+    tried = processor(bf16=8.4, fp32=54.8)
+    slow, exact = (seen(ball, shortcuts) for shortcuts in (half, dataclasses.replace(half, matmul="fp32")))
+    np.testing.assert_array_equal(slow.rgb, exact.rgb)
+    assert sorted(tried) == ["bf16", "fp32"]
+    processor(bf16=460.0, fp32=230.0)
+    assert not np.array_equal(seen(ball, half).rgb, exact.rgb)
+
+
+def test_a_processor_is_tried_once_and_only_where_bfloat16_is_asked_for(ball, processor):
+    tried = processor(bf16=1.0, fp32=2.0)
+    seen(ball, Shortcuts())
+    seen(ball, GRID)
+    assert not tried
+    for _ in range(3):
+        seen(ball, QUALITIES["balanced"])
+    assert len(tried) == 2
 
 
 def test_one_pixel_and_rays_that_only_graze_the_box(ball):

@@ -151,3 +151,25 @@ def test_a_warm_up_rises_to_the_schedule():
 def test_rates_that_cannot_be_are_refused(first, last):
     with pytest.raises(ValueError, match="learning rate"):
         LogLinear(first, last, 10)
+
+
+@pytest.mark.parametrize(
+    ("value", "written"),
+    [
+        (1e39, 2**128 - 2**104),
+        (-1e300, 2**104 - 2**128),
+        (1e-60, 0),
+        (float("inf"), float("inf")),
+        (2.5, 2.5),
+    ],
+)
+def test_numbers_beyond_float32_are_its_largest(tmp_path, event_type, value, written):
+    with EventFile(tmp_path, 0) as file:
+        file.numbers(3, {"train/gradient_norm/nerf": value})
+    assert events(file.path, event_type)[-1].summary.value[0].simple_value == written
+
+
+def test_a_huge_gradient_does_not_end_a_run(tmp_path):
+    with RunLog(tmp_path, 0) as log:
+        log.write(1, "train", {"loss": 0.5, "gradient_norm": {"nerf": 1e39}})
+    assert read_log(tmp_path / "log.jsonl", "train")[0]["gradient_norm"] == {"nerf": 1e39}

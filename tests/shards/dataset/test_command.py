@@ -35,7 +35,7 @@ def test_dry_run_writes_nothing_and_says_what_it_would_take(own, tmp_path, capsy
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
     printed = capsys.readouterr().out
     assert "3 identities, 9 views" in printed
-    assert "2 shards (0 to 1)" in printed
+    assert "2 shards (0 to 1) of 42.2 kB in all" in printed
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pytest
 
 from preface.artifacts import ArtifactError
 from preface.cli import build_shards_export
+from preface.cli.inspect import inspect
 
 Usage = namedtuple("Usage", "total used free")
 
@@ -48,3 +49,27 @@ def test_more_than_the_disk_has_room_for_is_refused_before_anything_is_written(
         export(folder, "--format", kind, "--views", "camera0", "--output", tmp_path / "new" / "out")
     assert "Choose fewer identities" in caught.value.remedy
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("kind", ["rays", "transforms"])
+def test_an_export_can_be_inspected_as_a_folder_and_person_by_person(folder, tmp_path, kind):
+    output = tmp_path / "out"
+    people = ("id0001", "id0002")
+    lines = export(
+        folder, "--format", kind, "--identities", *people, "--views", "camera0", "--output", output
+    )
+    reports = inspect(output)
+    assert [report.summary["identity"] for report in reports] == list(people)
+    assert [str(report.path) for report in reports] == lines[:2]
+    for report in [*reports, *inspect(lines[0])]:
+        assert not report.problems
+        assert report.summary["kind"].startswith("an export for other programs")
+        assert report.summary["cameras"] == ["camera0"]
+
+
+def test_an_image_that_is_missing_from_an_export_is_a_problem(folder, tmp_path):
+    export(folder, "--format", "transforms", "--views", "camera0", "--output", tmp_path / "out")
+    (tmp_path / "out" / "id0003" / "images" / "camera0.png").unlink()
+    (problem,) = (problem for report in inspect(tmp_path / "out") for problem in report.problems)
+    assert problem.path == tmp_path / "out" / "id0003" / "transforms.json"
+    assert "there is no images/camera0.png beside it" in problem.problem

@@ -65,7 +65,7 @@ def difference(one: FitConfig, other: FitConfig) -> dict:
     ],
 )
 def test_a_row_differs_from_the_full_method_in_one_thing(variant, expected, tmp_path):
-    base = Base(tmp_path, "reference", *defaults("reference"))
+    base = Base(tmp_path, "paper", *defaults("paper"))
     cells = {cell.variant.name: cell for cell in cells_of(list(tables(COUNTS, SIZE).values()), ["anna"], [3])}
     full = base.fit(cells["full"], tmp_path / "prior", ["a", "b"], tmp_path / "head")
     fit = base.fit(cells[variant], tmp_path / "prior", ["a", "b"], tmp_path / "head")

@@ -104,7 +104,7 @@ def test_the_demo_refuses_what_it_does_not_know_before_it_does_anything():
 
 def test_what_is_missing_is_named(made, tmp_path, capsys):
     assert show_demo.main([str(tmp_path)]) == 1
-    assert "show_demo:" in capsys.readouterr().err
+    assert str(tmp_path / show_demo.HEAD) in capsys.readouterr().err
     (tmp_path / "stages.tsv").write_text("fit\tsoon\tpreface-fit\n")
     with pytest.raises(show_demo.ArtifactError, match="'soon' is not a number of seconds"):
         show_demo.read_stages(tmp_path / "stages.tsv")

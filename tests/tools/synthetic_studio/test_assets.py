@@ -125,8 +125,9 @@ def test_assets_are_found_in_the_folder_or_up_to_two_levels_below(tmp_path, belo
 
 def test_a_folder_without_assets_is_refused_with_a_remedy(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
-    status = main([f"--output={tmp_path / 'studio'}", f"--assets={tmp_path / 'empty'}"])
-    assert status == 2
+    with pytest.raises(SystemExit) as stop:
+        main([f"--output={tmp_path / 'studio'}", f"--assets={tmp_path / 'empty'}"])
+    assert stop.value.code == 2
     message = capsys.readouterr().err
     assert f"--assets {tmp_path / 'empty'}" in message
     assert "name the folder" in message

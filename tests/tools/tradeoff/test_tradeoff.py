@@ -111,7 +111,7 @@ def test_fits_vary_one_thing_at_a_time_and_none_is_longer_than_asked(tmp_path):
     assert {fit.group for fit in found} == {"as it is", "steps", "inversion", "rays"}
 
 
-def test_qualities_are_fitted_as_they_are_and_rendered_by_their_own(tmp_path):
+def test_qualities_are_fitted_as_they_are(tmp_path):
     import ball_heads
 
     ball_heads.write_dataset(tmp_path)
@@ -120,16 +120,34 @@ def test_qualities_are_fitted_as_they_are_and_rendered_by_their_own(tmp_path):
         quality="draft", resolutions=[], most_steps=10**6, vary=["quality"],
     )  # fmt: skip
     found = list(fits(options, "someone"))
-    assert [fit.rendered for fit in found] == ["draft", "balanced", "reference"]
+    assert [fit.config.quality for fit in found] == ["draft", "balanced", "reference", "paper"]
     for fit in found:
         quality = fit.config.quality
-        assert quality == fit.rendered
+        assert fit.name == f"quality {quality}"
         assert (fit.config.inversion, fit.config.finetuning, fit.config.run) == defaults(quality)
-    assert len({fit.config.output for fit in found}) == 3
+    assert len({fit.config.output for fit in found}) == 4
     options.most_steps = found[1].config.finetuning.steps
-    assert [fit.rendered for fit in fits(options, "someone")][:2] == ["draft", "balanced"]
+    assert [fit.config.quality for fit in fits(options, "someone")][:2] == ["draft", "balanced"]
     options.most_steps = found[0].config.finetuning.steps
-    assert [fit.rendered for fit in fits(options, "someone")] == ["draft"]
+    assert "balanced" not in [fit.config.quality for fit in fits(options, "someone")]
+
+
+def test_a_fit_is_on_the_front_of_a_figure_if_nothing_cheaper_is_better_by_it():
+    rows = [("a", 1.0, 30.0, 0.3), ("b", 2.0, 29.0, 0.2), ("c", 3.0, 29.5, 0.25)]
+    points = [
+        {
+            "name": n,
+            "group": "",
+            "person": "x",
+            "cpu_s": s,
+            "psnr": p,
+            "lpips": d,
+            "view_cpu_s": 1.0,
+            "peak_mib": 1.0,
+        }
+        for n, s, p, d in rows
+    ]
+    assert [row["front"] for row in means(points)] == [["psnr", "lpips"], ["lpips"], []]
 
 
 def test_a_sweep_goes_on_only_with_the_views_that_it_began_with(tmp_path: Path):
@@ -149,7 +167,7 @@ def test_a_fit_is_measured_at_the_views_that_it_was_not_fitted_to(tmp_path):
     ball_heads.write_dataset(tmp_path)
     with threads(1):
         config = small_fits.config(tmp_path, "none", tmp_path / "head")
-        found = measure(Fit("steps 8", "steps", config, tmp_path, "reference"))
+        found = measure(Fit("steps 8", "steps", config, tmp_path))
         held_out = small_fits.held_out_psnr(tmp_path, tmp_path / "head")
     assert {"ssim", "lpips", "psnr_face", "cpu_s", "view_cpu_s", "peak_mib"} <= set(found)
     # A mean of decibels in place of decibels of a mean: near, and not the same.

@@ -1,12 +1,21 @@
-"""``--quality`` and a flag for each shortcut of rendering, for the commands that render."""
+"""Flags of the commands that render: where, ``--quality``, and one for each shortcut of rendering."""
 
 import argparse
 import dataclasses
 from typing import Any
 
 from preface.cli.field_texts import field_texts
+from preface.cli.output import whole_number
 from preface.cli.usage import UsageError
 from preface.model.rendering.shortcuts import DEFAULT_QUALITY, QUALITIES, Shortcuts
+
+
+def add_device_flags(group: argparse._ArgumentGroup) -> None:
+    """Add ``--device`` and ``--rays-at-a-time``."""
+    group.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
+    group.add_argument(
+        "--rays-at-a-time", type=whole_number(1), default=4096, metavar="N", help="memory goes with it"
+    )
 
 
 def add_quality_flags(parser: argparse.ArgumentParser) -> None:
