@@ -115,7 +115,9 @@ def alignment(measured: Any) -> Iterator[Row]:
 
 
 def _keypoints(row: Any) -> str:
-    return f"keypoints {row['RMS mm']:.2f} mm RMS, {row['without bias mm']:.2f} without what all people share"
+    without = f"; {row['excluded']} of the people left out" if row.get("excluded") else ""
+    shared = f"{row['without bias mm']:.2f} without what all people share"
+    return f"keypoints {row['RMS mm']:.2f} mm RMS, {shared}{without}"
 
 
 def image_preparation(measured: Any) -> Iterator[Row]:

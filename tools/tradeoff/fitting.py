@@ -182,16 +182,16 @@ def sweep(options: argparse.Namespace) -> list[str]:
 
 
 def means(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Means over people, and the figures by which nothing that took less CPU time is better."""
+    """Means over people, and the figures by which nothing that took less CPU time is as good."""
     rows = []
     for name in dict.fromkeys(p["name"] for p in points):
         some = [p for p in points if p["name"] == name]
         figures = {key: sum(p[key] for p in some) / len(some) for key in (*FIGURES, *TAKEN) if key in some[0]}
         rows.append({"name": name, "group": some[0]["group"], "people": len(some), **figures})
     for row in rows:
-        cheaper = [other for other in rows if other["cpu_s"] <= row["cpu_s"]]
+        cheaper = [other for other in rows if other["cpu_s"] < row["cpu_s"]]
         row["front"] = [
-            name for name in FIGURES if name in row and not any(_better(name, o, row) for o in cheaper)
+            name for name in FIGURES if name in row and all(_better(name, row, o) for o in cheaper)
         ]
     return rows
 

@@ -106,7 +106,7 @@ def _require(holds: bool, name: str, value: object, wanted: str) -> None:
 QUALITIES: dict[str, Shortcuts] = {
     "draft": Shortcuts(
         folded=True,
-        occupancy=64,
+        occupancy=48,
         skipped_rounds=8,
         sample_share=0.5,
         weight_bound=0.005,
