@@ -138,7 +138,7 @@ def _evaluate(
     job: Job, folder: Path, dataset: Dataset, options: EvaluationOptions, measure: Judge, *, images: bool
 ) -> HeadResult:
     """Evaluate a head view by view, keeping figures and small pictures."""
-    figures, pictures, began = [], [], time.perf_counter()
+    figures, pictures, told, began = [], [], set[str](), time.perf_counter()
     evaluated = evaluate_views(job.prior, dataset, job.identity, job.views, options, measure)
     for number, view in enumerate(evaluated, 1):
         figures.append(view.figures)
@@ -152,7 +152,9 @@ def _evaluate(
             f"{number} of {len(job.views)} views, {passed:.0f} s, about {left:.0f} s left"
         )
         for name, why in view.figures.left_out.items():
-            say(f"{job.name}, {view.figures.name}: no {name}: {why}")
+            if name not in told:  # once; the page lists every view
+                say(f"{job.name}, from {view.figures.name} on: no {name}: {why}")
+        told.update(view.figures.left_out)
     fitted = fitted_views(job.prior, dataset, job.identity)
     there = camera_names(dataset, job.identity)
     inputs = tuple(

@@ -69,6 +69,24 @@ def test_heads_side_by_side_leave_figures_tables_pictures_and_a_page(models, sha
     assert [one.path.parent.name for one in inspect(out)] == ["out", *names]
 
 
+def test_a_figure_that_no_view_can_have_is_told_of_once(models, shards, tmp_path, capsys):
+    arguments = [
+        "--shards",
+        str(shards),
+        "--output",
+        str(tmp_path / "out"),
+        "--lpips",
+        "alex",
+        "--no-normals",
+    ]
+    assert main([str(models / "with" / "head"), *arguments]) == 0
+    told = "".join(capsys.readouterr())
+    assert told.count("no lpips_alex: 24x32 pixels are too few") == 1
+    views = read_metrics(tmp_path / "out" / "head")["views"]
+    assert len(views) > 1
+    assert all("lpips_alex" in view["left_out"] for view in views)
+
+
 def test_a_folder_that_holds_other_things_is_left_alone(models, shards, tmp_path, capsys):
     (tmp_path / "holiday.jpg").write_bytes(b"mine")
     arguments = ["--shards", str(shards), "--output", str(tmp_path), "--lpips", "none"]
