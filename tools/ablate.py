@@ -33,7 +33,7 @@ from ablation.running import Ablation, StoppedError
 from preface.artifacts import ArtifactError
 from preface.cli.output import exit_status, resumable, whole_number
 from preface.cli.usage import UsageError
-from preface.model.fitting.configuration import QUALITIES, FinetuningConfig, check, defaults
+from preface.model.fitting.configuration import QUALITIES, check, defaults
 from preface.model.matmul import denormals_flushed, keep_freed_memory
 from preface.model.pretrained import prior_flag
 from preface.model.training.configuration import TrainingConfigError
@@ -103,8 +103,6 @@ def _require_training_heads(prior: Prior, dataset: Dataset, every: Mapping[str, 
 
 def _base(arguments: argparse.Namespace) -> Base:
     inversion, finetuning, run = defaults(arguments.quality)
-    paper = FinetuningConfig()  # qualities may leave out what the full method has
-    finetuning = replace(finetuning, normals=paper.normals, view_weights=paper.view_weights)
     if arguments.inversion_steps is not None:
         inversion = replace(inversion, steps=arguments.inversion_steps)
     if arguments.finetuning_steps is not None:

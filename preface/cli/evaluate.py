@@ -80,13 +80,13 @@ def _parser() -> argparse.ArgumentParser:
         "--quality",
         choices=tuple(QUALITIES),
         default="reference",
-        help="shortcuts of rendering (default: reference, none, so that figures are the head's and not theirs)",
+        help="shortcuts of rendering (default: reference, none: the model as it was trained)",
     )
     speed.add_argument(
         "--normals",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="show normals on the sheets; no figure depends on them, and without them rendering takes some six tenths "
+        help="show normals on the sheets; no figure depends on them, and without them rendering takes some two thirds "
         "of the time (default: shown)",
     )
     add_device_flags(speed)

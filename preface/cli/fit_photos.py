@@ -42,9 +42,8 @@ from preface.shards.manifest import read_manifest
 
 FOLDER = "photos"  # in the head's
 BASELINE_SIZE = (128, 192)  # of the views where there is no prior whose resolution could be taken
-MAX_MULTIPLE = (
-    8  # of the prior's resolution, for `paper`: beyond, a window around the head holds no more pixels
-)
+# Of the prior's resolution, for `paper`: beyond, a window around the head holds no more pixels.
+MAX_MULTIPLE = 8
 
 Say = Callable[[str], None]
 

@@ -150,8 +150,8 @@ STAGES = (
         "Evaluate",
         "evaluation",
         "`reference`, with normals",
-        "Figures are to be the head's and not the renderer's; normals are shown because a head can be right in colour "
-        "and wrong in shape.",
+        "Figures are to be those of the model as trained; normals are shown because a head can be right in colour and "
+        "wrong in shape.",
         evaluation,
     ),
 )

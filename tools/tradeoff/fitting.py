@@ -138,10 +138,8 @@ def measure(fit: Fit) -> dict[str, Any]:
     seconds = time.process_time() - began
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     assert fit.config.identity is not None
-    dataset, options = (
-        Dataset(fit.evaluated),
-        EvaluationOptions("none", quality=DEFAULT_QUALITY, normals=False),
-    )
+    dataset = Dataset(fit.evaluated)
+    options = EvaluationOptions("none", quality=DEFAULT_QUALITY, normals=False)
     began = time.process_time()
     found = evaluate_head(read_prior(ended.path), dataset, fit.config.identity, None, options)
     per_view = (time.process_time() - began) / len(found.views)
