@@ -138,10 +138,7 @@ class PriorModel(nn.Module):
         if evaluated is not None:
             group = None if group is None else group[evaluated]
             jitter = None if jitter is None else jitter[evaluated]
-        proposal = self.proposal.biases(code, group, len(some))
-        levels = self._propose(some, proposal, train_frac, jitter)
-        last = len(self.config.samples) - 1
-        sdist, tdist = self._place(some, levels, last, train_frac, jitter)
+        levels, sdist, tdist = self._found(some, code, group, train_frac, jitter)
         biases = self.nerf.biases(code, group, len(some))
         features, raw, found = self._final(some, tdist, biases, normals)
         levels = (*levels, self._level(some, sdist, tdist, raw))
@@ -153,6 +150,37 @@ class PriorModel(nn.Module):
             predicted = self.nerf.raw_normals(features, biases[depth + 2]).view(found.shape)
             predicted = losses.normals_from_density_gradient(predicted)
         return _assemble(rays, some, evaluated, levels, color, background, (found, predicted))
+
+    def rounds(
+        self, rays: Rays, code: Tensor | None = None, *, jitter: Tensor | None = None
+    ) -> tuple[Level, ...]:
+        """Where rays find something, without its colour: what teaches proposals alone.
+
+        Args:
+            rays: n of them, all evaluated.
+            code: [1, latent]; None for a model without codes.
+            jitter: [n, rounds], see `forward`.
+
+        Returns:
+            The rounds, as `Render.levels`; no derivative reaches the NeRF network.
+
+        Raises:
+            ValueError: codes that do not fit the model.
+        """
+        group = self._groups(len(rays), code, None)
+        levels, sdist, tdist = self._found(rays, code, group, 1.0, jitter)
+        with torch.no_grad():
+            biases = self.nerf.biases(code, group, len(rays))
+            raw = self._final(rays, tdist, biases, normals=False)[1]
+        return (*levels, self._level(rays, sdist, tdist, raw))
+
+    def _found(
+        self, rays: Rays, code: Tensor | None, group: Tensor | None, train_frac: float, jitter: Tensor | None
+    ) -> tuple[tuple[Level, ...], Tensor, Tensor]:
+        """All rounds but the last, and where that one looks."""
+        biases = self.proposal.biases(code, group, len(rays))
+        levels = self._propose(rays, biases, train_frac, jitter)
+        return levels, *self._place(rays, levels, len(self.config.samples) - 1, train_frac, jitter)
 
     def _groups(self, rays: int, code: Tensor | None, group: Tensor | None) -> Tensor | None:
         """The row of `code` per ray; None if there is but one, or none."""

@@ -88,6 +88,10 @@ class FinetuningConfig:
     """Adam's epsilon, see ``preface-train``."""
     interlevel: float = 1.0
     """Weight of the loss that teaches the proposal network. The paper: 1."""
+    elsewhere: float = 0.0
+    """Share of the rays of a step that are turned about the head and rendered again, without colours, to teach the
+    proposal network there, too; 0 for none. Proposals that know the views fitted to alone miss what others see. The
+    paper: none."""
     opacity: float = 0.0
     """Weight of the mean absolute difference between opacity and mask, on black; 0 for none. Colours alone cannot tell
     black hair from a black background. The paper: none."""
@@ -204,12 +208,12 @@ QUALITIES: dict[str, tuple[InversionConfig, FinetuningConfig, FitRunConfig]] = {
     ),
     "balanced": (
         InversionConfig(steps=40, patches=2, patch=16, rate=2e-2),
-        FinetuningConfig(steps=800, rays=256, foreground_share=0.5, opacity=0.1),
+        FinetuningConfig(steps=800, rays=256, foreground_share=0.5, elsewhere=0.25, opacity=0.1),
         FitRunConfig(micro_rays=512, preview_every=0),
     ),
     "reference": (
         InversionConfig(steps=40, patches=2, patch=16, rate=2e-2),
-        FinetuningConfig(steps=3000, rays=256, foreground_share=0.5, opacity=0.1),
+        FinetuningConfig(steps=3000, rays=256, foreground_share=0.5, elsewhere=0.25, opacity=0.1),
         FitRunConfig(micro_rays=512, preview_every=0),
     ),
     "paper": (InversionConfig(), FinetuningConfig(), FitRunConfig()),
@@ -300,6 +304,7 @@ def check(config: FitConfig) -> None:
     possible = isinstance(levels, str) or 0 <= levels <= MAX_LEVELS
     require(possible, "finetuning.levels", levels, f"give 0 to {MAX_LEVELS}, auto or prior")
     _check_share("finetuning.foreground-share", finetuning.foreground_share)
+    _check_share("finetuning.elsewhere", finetuning.elsewhere)
     limits = {"micro_rays": 1, "log_every": 1, "checkpoint_minutes": 0, "preview_every": 0}
     _check_numbers("", run, limits)
 

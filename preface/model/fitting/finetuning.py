@@ -1,8 +1,8 @@
 """Finetuning: all weights, and the code, adapt to the views; regularised so that new views stay a face.
 
 The paper, equation 3: absolute difference, interlevel loss, predicted normals whose second-order gradients reach the
-density, and the squared norm of the weights through which the direction acts. Opacity and orientation are ours to ask
-for.
+density, and the squared norm of the weights through which the direction acts. Opacity, orientation and what proposals
+are taught elsewhere are ours to ask for.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from preface.geometry import Box
 from preface.model import losses
 from preface.model.fitting.configuration import FinetuningConfig
+from preface.model.fitting.elsewhere import interlevel_elsewhere
 from preface.model.fitting.heads import Correction, head_renderer
 from preface.model.fitting.observations import view_loader
 from preface.model.model import PriorModel, Render
@@ -60,7 +62,7 @@ def finetuning_trainer(
     sampler = SingleRays(data.train, seed, config.rays, config.foreground_share)
     trainer = Trainer(
         parameter_sets(model, config, steps),
-        finetuning_terms(model, config, correction),
+        [*finetuning_terms(model, config, correction), *_elsewhere(model, config, data, seed)],
         head_renderer(
             model, seed, share_done, correction, normals=config.normals > 0 or config.orientation > 0
         ),
@@ -102,6 +104,15 @@ def finetuning_terms(
 
         terms.append(LossTerm("view_weights", config.view_weights, view_weights))
     return terms
+
+
+def _elsewhere(model: PriorModel, config: FinetuningConfig, data: TrainingData, seed: int) -> list[LossTerm]:
+    """What proposals are taught where no photograph was taken, if that is asked for."""
+    if config.elsewhere == 0 or config.interlevel == 0:
+        return []
+    box = Box(data.scene.box[0], data.scene.box[1])
+    taught = interlevel_elsewhere(model, box, data.scene.scene_scale, config.elsewhere, seed)
+    return [LossTerm("interlevel_elsewhere", config.interlevel, taught)]
 
 
 def predicted_normals(render: Render, part: Part) -> Tensor:

@@ -20,13 +20,13 @@ from preface.shards.streams import bits, stream_key
 _JITTER = 101  # what this stream of random numbers is for; see preface.shards.streams
 
 
-def jitter(seed: int, step: int, first: int, rays: int, rounds: int) -> np.ndarray:
+def jitter(seed: int, step: int, first: int, rays: int, rounds: int, stream: int = _JITTER) -> np.ndarray:
     """Where samples lie within their intervals, float32 [rays, rounds] in [0, 1).
 
     A pure function of the seed, the step and the ray's number in it, however rays are split into parts and
-    over processes.
+    over processes. Another `stream` gives other numbers.
     """
-    drawn = bits(stream_key(seed, step, _JITTER), first * rounds, rays * rounds)
+    drawn = bits(stream_key(seed, step, stream), first * rounds, rays * rounds)
     return ((drawn >> np.uint64(40)).astype(np.float32) * np.float32(2.0**-24)).reshape(rays, rounds)
 
 
