@@ -81,9 +81,10 @@ def render(measured: Any) -> Iterator[Row]:
 
 
 def _rendered(choice: str, point: Mapping[str, Any], *, default: bool) -> Row:
-    full, truth = point["psnr_to_full"], point["psnr"]
-    time = processor_time(cost(point, IMAGES) / point["rays"], "per ray")
-    return Row(choice, time, f"{full:.1f} dB to the fullest render, {truth:.2f} to photographs", default)
+    to_trained = None if point["group"] == "reference" else point.get("psnr_to_trained")
+    own = "" if to_trained is None else f"{to_trained:.1f} dB to the model as trained, "
+    error = f"{own}{point['psnr_to_full']:.1f} dB to the fullest render, {point['psnr']:.2f} to photographs"
+    return Row(choice, processor_time(cost(point, IMAGES) / point["rays"], "per ray"), error, default)
 
 
 def large_images(measured: Any) -> Iterator[Row]:

@@ -1,4 +1,4 @@
-"""A way to render, measured: figures to the photographs and to the fullest render, processor time, memory, operations.
+"""A way to render, measured: figures to photographs and to full renders, processor time, memory, operations.
 
 Every point runs in a process of its own on one thread, so that its peak memory is its own. Time is that of the
 processor, which other programs change less than the clock's.
@@ -36,7 +36,8 @@ from preface.shards import Dataset
 from tradeoff.points import NORMALS, Point
 
 RAYS_AT_A_TIME = 4096
-KEPT = ("rgb", "alpha", "depth")  # of the fullest render
+KEPT = ("rgb", "alpha", "depth")  # of full renders
+MOST = 100.0  # dB, of images that are equal
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Task:
         folder: of the model, or `pretrained`.
         shards: of the photographs.
         views: identity and camera of each.
-        full: folder of the fullest renders; written there if the point is the fullest itself.
+        full: folder of the fullest renders and of those as trained; written there if the point is one of them.
     """
 
     point: Point
@@ -65,7 +66,7 @@ def measure_apart(task: Task) -> dict[str, Any]:
 
 
 def measure(task: Task) -> dict[str, Any]:
-    """Figures of a point: means over views, and the lowest PSNR to the fullest render."""
+    """Figures of a point: means over views, and the lowest PSNR to full renders."""
     torch.set_num_threads(1)
     keep_freed_memory()
     with denormals_flushed():
@@ -90,9 +91,10 @@ def _measured(task: Task) -> dict[str, Any]:
         values = dict(measuring.whole(np.clip(image.rgb, 0, 1), truth, image.alpha, mask).values)
         rows.append({**values, **seconds, **_to_full(task, identity, camera, image)})
     mean = {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
-    lowest = min(row["psnr_to_full"] for row in rows)
+    to_others = ("psnr_to_full", "psnr_to_trained")
+    lowest = {f"lowest_{name}": min(row[name] for row in rows) for name in to_others if name in rows[0]}
     flops = _operations(prior, model, dataset, task)
-    return {**mean, "lowest_psnr_to_full": lowest, "peak_mib": peak, "mflop_per_ray": flops}
+    return {**mean, **lowest, "peak_mib": peak, "mflop_per_ray": flops}
 
 
 def _render(
@@ -126,21 +128,35 @@ def _warm_up(prior: Prior, model: PriorModel, point: Point) -> None:
 
 
 def _to_full(task: Task, identity: str, camera: str, image: RenderedImage) -> dict[str, float]:
-    """PSNR, opacity and depth against the fullest render, which is written if this is it."""
-    path = task.full / f"{task.point.model}-{identity}-{camera}.npz"
-    if task.point.group == "fullest":
+    """PSNR, opacity and depth against the fullest render, and PSNR against the model as trained."""
+    of = f"{task.point.model}-{identity}-{camera}.npz"
+    fullest = task.point.group == "fullest"
+    full = _kept(task.full / f"fullest-{of}", image, write=fullest)
+    solid = np.isfinite(full["depth"]) & np.isfinite(image.depth)
+    off = np.abs(image.depth - full["depth"])[solid] * 1000
+    found = {
+        "psnr_to_full": _decibels(image.rgb, full["rgb"]),
+        "alpha_off": float(np.abs(image.alpha - full["alpha"]).mean()),
+        "depth_off_median_mm": float(np.median(off)) if len(off) else 0.0,
+        "depth_off_p95_mm": float(np.percentile(off, 95)) if len(off) else 0.0,
+    }
+    if fullest:  # which is measured before there is a render as trained
+        return found
+    trained = _kept(task.full / f"trained-{of}", image, write=task.point.as_trained)
+    return {**found, "psnr_to_trained": _decibels(image.rgb, trained["rgb"])}
+
+
+def _kept(path: Path, image: RenderedImage, *, write: bool) -> dict[str, np.ndarray]:
+    """The render that others are compared with, written first if this is it."""
+    if write:
         path.parent.mkdir(parents=True, exist_ok=True)
         np.savez(path, **{name: getattr(image, name) for name in KEPT})
-    with np.load(path) as full:
-        solid = np.isfinite(full["depth"]) & np.isfinite(image.depth)
-        off = np.abs(image.depth - full["depth"])[solid] * 1000
-        decibels = psnr(torch.from_numpy(image.rgb), torch.from_numpy(full["rgb"]))
-        return {
-            "psnr_to_full": min(decibels, 100.0),
-            "alpha_off": float(np.abs(image.alpha - full["alpha"]).mean()),
-            "depth_off_median_mm": float(np.median(off)) if len(off) else 0.0,
-            "depth_off_p95_mm": float(np.percentile(off, 95)) if len(off) else 0.0,
-        }
+    with np.load(path) as kept:
+        return {name: kept[name] for name in KEPT}
+
+
+def _decibels(image: np.ndarray, other: np.ndarray) -> float:
+    return min(psnr(torch.from_numpy(image), torch.from_numpy(other)), MOST)
 
 
 def _operations(prior: Prior, model: PriorModel, dataset: Dataset, task: Task) -> float:

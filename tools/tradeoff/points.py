@@ -33,6 +33,11 @@ class Point:
     samples: tuple[int, ...] | None
     shortcuts: Shortcuts
 
+    @property
+    def as_trained(self) -> bool:
+        """Whether it is the model itself, without shortcuts."""
+        return self.samples is None and self.shortcuts == Shortcuts()
+
     def settings(self) -> dict[str, Any]:
         """As JSON data."""
         samples = None if self.samples is None else list(self.samples)

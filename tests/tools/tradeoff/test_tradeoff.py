@@ -26,6 +26,8 @@ from tradeoff.report import plot, table
 def point(name, seconds, psnr, to_full, group="together", prepare=0.0, model=0):
     figures = {"lowest_psnr_to_full": to_full - 1, "alpha_off": 0.0, "depth_off_median_mm": 0.1}
     figures |= {"depth_off_p95_mm": 0.2, "mflop_per_ray": 1.0, "peak_mib": 10.0, "ssim": 0.9, "lpips": 0.1}
+    if group != "fullest":
+        figures |= {"psnr_to_trained": to_full + 1, "lowest_psnr_to_trained": to_full}
     return {
         "name": name, "group": group, "settings": {"model": model}, "rays": 10**6, "cpu_us_per_ray": seconds,
         "prepare_cpu_s": prepare, "psnr": psnr, "psnr_to_full": to_full, **figures,
@@ -64,7 +66,10 @@ def test_qualities_follow_their_rules_and_say_so_where_no_point_will_do():
     assert chosen(points, 1) == {"draft": "to look at", "balanced": "near", "reference": "as trained"}
     assert chosen([reference], 1)["balanced"] == "as trained"
     assert chosen([point("as trained", 10.0, 30.0, 45.5, group="reference")], 1)["balanced"] is None
-    assert "| near |" in table(points, 1, chosen(points, 1))
+    found = table(points, 1, chosen(points, 1))
+    assert "| near |" in found
+    assert "| 46.50 (45.50) | 47.50 (46.50) |" in found
+    assert len({line.count("|") for line in found.splitlines()}) == 1
     assert plot(points, 1, chosen(points, 1))[:8] == b"\x89PNG\r\n\x1a\n"
 
 
