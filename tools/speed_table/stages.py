@@ -6,7 +6,7 @@ marked by what the code has as its default, where a module says so.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,22 +77,34 @@ def calibration(measured: Any) -> Iterator[Row]:
     for line in measured["studio"]:
         if line["errors"] is None:
             continue
-        scale, frames, errors = line["scale"], line["frames"], line["errors"]
-        bound = errors["center"] / errors["center_bound"]
+        scale, frames = line["scale"], line["frames"]
         finding = per_image[scale] * images[scale] * frames / most
         words = DETECTIONS[scale.split(" ")[0]].format(scale.split(" ")[-1])
         yield Row(
             f"{words}, {frames} frames, {line['backend']} solver",
             f"{finding:.0f} s to detect, {line['seconds']:.1f} s to solve",
-            f"camera centres {1e3 * errors['center']:.4f} mm, {bound:.2f} of the Cramer-Rao bound",
+            _centres(line["errors"]),
             (scale, frames, line["backend"]) == ("full", most, "own"),
         )
+    for line in measured["simulated"]:
+        if line["errors"] is not None:
+            choice = f"simulated corners, {line['frames']} frames, {line['backend']} solver"
+            yield Row(choice, f"{line['seconds']:.1f} s to solve", _centres(line["errors"]))
+
+
+def _centres(errors: Mapping[str, float]) -> str:
+    bound = errors["center"] / errors["center_bound"]
+    return (
+        f"camera centres {1e3 * errors['center']:.4f} mm, {bound:.2f} of the Cramer-Rao bound; "
+        f"corners to {errors['noise']:.3f} pixels"
+    )
 
 
 def alignment(measured: Any) -> Iterator[Row]:
     """Search sides, crops, views and triangulations."""
     usual, tables = DetectionOptions(), measured["tables"]
     views = max((row["views"] for row in tables["views"]), default=0)
+    most = max(row["keypoints"] for rows in tables.values() for row in rows if "RMS mm" in row)
     told: dict[str, tuple[str, Callable[[Any], str], Any]] = {
         "scale": ("search side", lambda value: f"faces searched at {value} pixels", usual.scale),
         "crops": (
@@ -107,17 +119,21 @@ def alignment(measured: Any) -> Iterator[Row]:
             if "RMS mm" in row:
                 seconds = row["read s"] + row["find s"] + row["align s"]
                 time = processor_time(seconds, "per person")
-                yield Row(words(row[key]), time, _keypoints(row), row[key] == default)
+                yield Row(words(row[key]), time, _keypoints(row, most), row[key] == default)
     for row in tables["triangulation"]:
         if "RMS mm" in row:
             time = processor_time(row["align s"], "per person")
-            yield Row(f"triangulation: {row['method']}", time, _keypoints(row), row["method"] == "ours")
+            yield Row(f"triangulation: {row['method']}", time, _keypoints(row, most), row["method"] == "ours")
 
 
-def _keypoints(row: Any) -> str:
-    without = f"; {row['excluded']} of the people left out" if row.get("excluded") else ""
-    shared = f"{row['without bias mm']:.2f} without what all people share"
-    return f"keypoints {row['RMS mm']:.2f} mm RMS, {shared}{without}"
+def _keypoints(row: Any, all_of_them: int) -> str:
+    """Errors of the keypoints that were found; none where half are missing, since those left are the easy ones."""
+    found = row["keypoints"]
+    missing = f"{all_of_them - found} of {all_of_them} keypoints not found" if found < all_of_them else ""
+    if 2 * found <= all_of_them:
+        return f"–; {missing}"
+    figures = f"keypoints {row['median mm']:.2f} mm in the median, {row['RMS mm']:.2f} RMS"
+    return f"{figures}; {missing}" if missing else figures
 
 
 def image_preparation(measured: Any) -> Iterator[Row]:
@@ -168,7 +184,8 @@ TO_SHARDS = (
         "Align",
         "alignment",
         f"faces searched at {DetectionOptions().scale} pixels, {DetectionOptions().jitters} crops, every view",
-        "It runs once per person; what it gets wrong, no later stage can mend.",
+        "It runs once per person; what it gets wrong, no later stage can mend. Choices are by the median: of so few "
+        "people, one keypoint of one of them moves the RMS by more than any choice.",
         alignment,
     ),
     Stage(

@@ -185,7 +185,7 @@ def test_what_was_not_measured_is_not_there():
 
 
 def test_calibrations_are_counted_by_their_frames_and_what_failed_is_left_out():
-    errors = {"center": 2e-5, "center_bound": 1e-5}
+    errors = {"center": 2e-5, "center_bound": 1e-5, "noise": 0.2}
     line = {"scale": "full", "frames": 40, "backend": "own", "seconds": 7.0, "errors": errors}
     measured = {
         "detection": [
@@ -193,17 +193,38 @@ def test_calibrations_are_counted_by_their_frames_and_what_failed_is_left_out():
             {"scale": "images 1/4", "failed": "too small"},
         ],
         "studio": [line, {**line, "frames": 10, "seconds": 2.0}, {**line, "backend": "x", "errors": None}],
+        "simulated": [{**line, "scale": "-", "seconds": 3.0}, {**line, "scale": "-", "errors": None}],
     }
     found = rows(readme.speed_for_accuracy([kept("calibration", measured)]))
     assert [cells[1] for cells in found] == [
         "**full detection, 40 frames, own solver**",
         "full detection, 10 frames, own solver",
+        "simulated corners, 40 frames, own solver",
     ]
     assert found[0][2:] == [
         "50 s to detect, 7.0 s to solve",
-        "camera centres 0.0200 mm, 2.00 of the Cramer-Rao bound",
+        "camera centres 0.0200 mm, 2.00 of the Cramer-Rao bound; corners to 0.200 pixels",
     ]
+    assert found[2][2] == "3.0 s to solve"
     assert found[1][2] == "12 s to detect, 2.0 s to solve"
+
+
+def test_alignments_have_no_figures_where_half_of_the_keypoints_are_missing():
+    line = {"views": 13, "keypoints": 20, "median mm": 1.5, "RMS mm": 2.8}
+    times = {"read s": 0.5, "find s": 2.5, "align s": 1.0}
+    views = [
+        line,
+        {**line, "views": 3, "keypoints": 16},
+        {**line, "views": 2, "keypoints": 10},
+    ]
+    tables = {"scale": [], "crops": [], "views": [{**row, **times} for row in views], "triangulation": []}
+    found = rows(readme.speed_for_accuracy([kept("alignment", {"tables": tables})]))
+    assert [cells[3] for cells in found] == [
+        "keypoints 1.50 mm in the median, 2.80 RMS",
+        "keypoints 1.50 mm in the median, 2.80 RMS; 4 of 20 keypoints not found",
+        "–; 10 of 20 keypoints not found",
+    ]
+    assert {cells[2] for cells in found} == {"4.00 CPU-s per person"}
 
 
 def test_a_render_quality_is_shown_only_as_it_is_now():
