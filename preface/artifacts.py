@@ -19,7 +19,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from preface.plain_words import in_plain_words, join_field, json_type, shown
+from preface.plain_words import in_plain_words, join_field, json_text, json_type, shown
 
 if TYPE_CHECKING:
     from jsonschema import Draft202012Validator
@@ -38,8 +38,6 @@ VERSIONED_PACKAGES = (
     "google-crc32c",
     "safetensors",
 )
-LINE_LENGTH = 100  # written values that fit on one such line stay on one line
-
 _OS_REMEDIES = {
     errno.ENOSPC: "Free some space on that disk and run again",
     errno.EDQUOT: "Free some of your quota on that disk and run again",
@@ -307,20 +305,6 @@ def json_types(value: Any, path: str | os.PathLike[str], field: str) -> Any:
         problem = f"is of type {type(value).__name__}, which JSON cannot hold"
         raise ArtifactError(path, field, problem, "Give numbers, texts, lists and objects")
     return value
-
-
-def json_text(value: Any, indent: str = "") -> str:
-    """JSON that people can read: short values and lists of numbers on one line, the rest indented."""
-    line = json.dumps(value, ensure_ascii=False, allow_nan=False)
-    is_list = isinstance(value, list)
-    nested = value if is_list else list(value.values()) if isinstance(value, dict) else []
-    scalars = is_list and not any(isinstance(item, list | dict) for item in nested)
-    if not nested or scalars or (indent and len(indent) + len(line) <= LINE_LENGTH):
-        return line
-    inner = indent + "  "
-    keys = [""] * len(nested) if is_list else [f"{json.dumps(k, ensure_ascii=False)}: " for k in value]
-    rows = ",\n".join(f"{inner}{key}{json_text(item, inner)}" for key, item in zip(keys, nested, strict=True))
-    return f"[\n{rows}\n{indent}]" if is_list else f"{{\n{rows}\n{indent}}}"
 
 
 # ------------------------------------------------------------------------------ paths, provenance

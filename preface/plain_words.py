@@ -1,5 +1,5 @@
-"""Values in words for people: numbers of things, room on a disk, and what is wrong with a JSON value for those who have
-never seen a JSON Schema.
+"""Values in words for people: numbers of things, room on a disk, times, JSON laid out to be read, and what is wrong
+with a JSON value for those who have never seen a JSON Schema.
 """
 
 import difflib
@@ -28,6 +28,7 @@ _BOUNDS = {
     "maxItems": "at most",
 }
 
+LINE_LENGTH = 100  # written JSON values that fit on one such line stay on one line
 MAX_CHOICES = 12  # named in a remedy; the rest are counted
 
 
@@ -42,6 +43,13 @@ def disk_space(count: float) -> str:
         if count >= of_unit:
             return f"{count / of_unit:.1f} {unit}"
     return f"{count / 1e3:.1f} kB"
+
+
+def duration(seconds: float) -> str:
+    """A time in the unit that suits it: "40 s", "12 min", "3.5 h"."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 def in_plain_words(error: "ValidationError") -> tuple[str, str, str]:
@@ -84,6 +92,20 @@ def in_plain_words(error: "ValidationError") -> tuple[str, str, str]:
         case _:
             problem = error.message[:200]
     return field, problem, remedy
+
+
+def json_text(value: Any, indent: str = "") -> str:
+    """JSON that people can read: short values and lists of numbers on one line, the rest indented."""
+    line = json.dumps(value, ensure_ascii=False, allow_nan=False)
+    is_list = isinstance(value, list)
+    nested = value if is_list else list(value.values()) if isinstance(value, dict) else []
+    scalars = is_list and not any(isinstance(item, list | dict) for item in nested)
+    if not nested or scalars or (indent and len(indent) + len(line) <= LINE_LENGTH):
+        return line
+    inner = indent + "  "
+    keys = [""] * len(nested) if is_list else [f"{json.dumps(k, ensure_ascii=False)}: " for k in value]
+    rows = ",\n".join(f"{inner}{key}{json_text(item, inner)}" for key, item in zip(keys, nested, strict=True))
+    return f"[\n{rows}\n{indent}]" if is_list else f"{{\n{rows}\n{indent}}}"
 
 
 def json_field(parts: Iterable[str | int]) -> str:

@@ -16,9 +16,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-BASE = {"plain_words", "artifacts", "srgb"}
+BASE = {"plain_words", "progress", "artifacts", "srgb"}
 MAY_IMPORT = {
     "plain_words": set(),
+    "progress": {"plain_words"},
     "geometry": set(),
     "srgb": set(),
     "artifacts": {"plain_words"},

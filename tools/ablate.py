@@ -30,9 +30,9 @@ from ablation.design import FULL_PRIOR, Base, Table, cells_of, five_views, table
 from ablation.paper import PAPER
 from ablation.priors import Priors, run_config
 from ablation.running import Ablation, StoppedError
-from preface.artifacts import ArtifactError
-from preface.cli.output import exit_status, resumable, whole_number
-from preface.cli.usage import UsageError
+from preface.artifacts import ArtifactError, sha256
+from preface.cli.output import exit_status, resumable, say, whole_number
+from preface.cli.usage import Parser, UsageError
 from preface.model.fitting.configuration import QUALITIES, check, defaults
 from preface.model.matmul import denormals_flushed, keep_freed_memory
 from preface.model.pretrained import prior_flag
@@ -41,6 +41,7 @@ from preface.model.training.loop import TrainingError
 from preface.model.training.prior_files import Prior, read_prior
 from preface.plain_words import suggestion
 from preface.shards import Dataset
+from preface.shards.manifest import MANIFEST_FILE
 
 SHARES = (1 / 16, 1 / 4, 1 / 2)  # of the prior's people, in the smaller priors
 PEOPLE = 3  # fitted unless they are named; the paper's number
@@ -86,17 +87,19 @@ def prepare(arguments: argparse.Namespace) -> Ablation:
 
 
 def _require_training_heads(prior: Prior, dataset: Dataset, every: Mapping[str, Table]) -> None:
-    """Refuse to train smaller priors where their heads are not in the shards, as with `--prior pretrained`.
+    """Refuse to train smaller priors on others than the prior's heads, as with `--prior pretrained`.
 
     Raises:
-        ArtifactError: naming a head that is not there, and the tables that need no other prior.
+        ArtifactError: naming a head that is not there, or other shards; and the tables that need no other prior.
     """
     absent = [name for name in prior.identities if name not in dataset.names]
-    if absent:
+    if absent or not _trained_on(prior, dataset):
         rest = [n for n, t in every.items() if all(row.variant.prior == FULL_PRIOR for row in t.rows)]
         problem = (
-            f"'{absent[0]}', whom the prior was trained on, is not there, and smaller priors need them all"
+            "are not those that the prior was trained on, and smaller priors are trained on the same heads"
         )
+        if absent:
+            problem = f"'{absent[0]}', whom the prior was trained on, is not there, and smaller priors need them all"
         remedy = f"Give the shards that it was trained on, or --only {' '.join(rest)}"
         raise ArtifactError(dataset.manifest.path, "identities", problem, remedy)
 
@@ -115,17 +118,35 @@ def _base(arguments: argparse.Namespace) -> Base:
 
 
 def _people(asked: Sequence[str] | None, dataset: Dataset, prior: Prior) -> list[str]:
-    """Who is fitted: those named, or the first that the prior does not know."""
+    """Who is fitted: those named, or the first that the prior does not know.
+
+    In other shards than the prior's, its names may be other people's; only who ran the studio knows.
+    """
+    same = _trained_on(prior, dataset)
     for name in asked or []:
         if name not in dataset.names:
             raise UsageError(f"--identities {name}: {suggestion(name, dataset.names)}")
-        if name in prior.identities:
+        if name in prior.identities and same:
             raise UsageError(f"--identities {name}: the prior was trained on this person; name others")
+        if name in prior.identities:
+            say(
+                f"note: the prior knows somebody by the name '{name}', from other shards; taken for another person"
+            )
     found = list(asked or [name for name in dataset.names if name not in set(prior.identities)][:PEOPLE])
-    if not found:
+    if not found and same:
         problem = "everybody was seen by the prior"
         raise ArtifactError(dataset.manifest.path, "identities", problem, "Build shards with --holdout")
+    if not found:
+        problem = "the prior, which was trained on other shards, knows everybody's name"
+        some = " ".join(dataset.names[:PEOPLE])
+        remedy = f"If these are other people, name who is fitted, such as --identities {some}"
+        raise ArtifactError(dataset.manifest.path, "identities", problem, remedy)
     return found
+
+
+def _trained_on(prior: Prior, dataset: Dataset) -> bool:
+    """Whether these are the shards that a prior was trained on."""
+    return bool(prior.provenance["inputs"].get(MANIFEST_FILE) == sha256(dataset.manifest.path))
 
 
 def _cameras(dataset: Dataset, identity: str) -> dict[str, int]:
@@ -158,9 +179,7 @@ def _views(
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    found = argparse.ArgumentParser(
-        "ablate.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    found = Parser("ablate.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     found.add_argument("shards", type=Path, help="folder of the shards")
     found.add_argument(
         "--prior",

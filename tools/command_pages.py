@@ -5,7 +5,6 @@ how a page looks. What no parser knows, what a command reads and writes and how 
 A test makes the pages again and compares.
 """
 
-import argparse
 import importlib
 import sys
 import tomllib
@@ -19,6 +18,7 @@ from preface.artifacts import write_bytes
 from preface.cli import fit, train
 from preface.cli.folders import make_folder
 from preface.cli.output import exit_status
+from preface.cli.usage import Parser
 from preface.model.fitting.configuration import QUALITIES as FIT_QUALITIES
 from preface.model.rendering import shortcuts
 from preface.model.training.configuration import TRAINING_PRESETS
@@ -32,7 +32,7 @@ SOURCE = "This page is made by `python tools/command_pages.py` from what `{} --h
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the pages; 0 when they are written, 1 when the disk refuses."""
-    parser = argparse.ArgumentParser("command_pages", description="Write a page per command.")
+    parser = Parser("command_pages", description="Write a page per command.")
     parser.add_argument("--output", type=Path, default=PAGES, help="folder (default: docs/commands)")
     folder = parser.parse_args(arguments).output
 

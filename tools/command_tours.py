@@ -88,7 +88,8 @@ TOURS = {
     ),
     "preface-render": Tour(
         f"a {_spec('prior or a head', 'prior')}; {_RIG} and an {_spec('alignment', 'alignment')}, where they are given",
-        f"colour, opacity, depth and normals as PNG and EXR, the {_spec('cameras', 'rig')}, a video, a mesh",
+        "colour, opacity, depth and normals as PNG and EXR, a legend of what the colours mean, the "
+        f"{_spec('cameras', 'rig')}, a video, a mesh",
         (
             "preface-render head --orbit 48 --video --output renders",
             "preface-render head --size 4096x4096 --mesh head.glb --output large",

@@ -1,10 +1,11 @@
 #!/usr/bin/env bash
 # The main job on a bare machine, from nothing: sets up, makes a small synthetic studio, calibrates its cameras from
 # pictures of a board, aligns its people, builds shards of them, trains a tiny prior on all but one of them, fits the
-# one that it has not seen from two photographs, with the prior and without, renders the head all around, measures it
-# on the photographs that were kept away, and shows it all on one page. About ten minutes on two cores, and five for
-# the set-up the first time. Every stage prints the command that it runs. Run again, it resumes where it stopped; delete
-# OUTPUT to begin anew.
+# one that it has not seen from two photographs, with the prior and without, renders the head from side to side,
+# measures it on the photographs that were kept away and its surface against the studio's. Then it fits the same person
+# from the prior that comes with preface, which has seen more people, and shows all of it on one page. About twelve
+# minutes on two cores, and five for the set-up the first time. Every stage prints the command that it runs. Run again,
+# it resumes where it stopped; delete OUTPUT to begin anew.
 # Prints the path of the page last.
 #   --pretrained  start from the prior that comes with preface and train none: one new person is photographed, aligned
 #                 on the prior's template and fitted
@@ -32,16 +33,17 @@ if $pretrained; then
     # Another seed than that of the studio which the prior was trained in: somebody new.
     studio=(--identities 1 --takes 1 --seed 2024)
     fitted=id0000
-    minutes=(0.5 0.1 0.1 0.3 0.2 0.1 1.5 1.2 0.5 1.0 0.1)
+    minutes=(0.5 0.1 0.1 0.3 0.2 0.1 1.5 1.2 0.5 1.0 0.5 0.1)
 else
     out=${OUTPUT:-demo_output}
     prior=$out/prior
     people=13
     studio=(--identities "$people")
     fitted=$(printf 'id%04d' $((people - 1))) # the last of them
-    minutes=(1.8 0.1 0.5 1.2 0.7 2.2 0.9 0.7 0.4 0.6 0.3)
+    minutes=(2.1 0.1 0.8 0.9 0.5 1.9 0.7 0.5 0.4 1.0 0.5 0.1 0.1 0.9 0.6 0.7 0.4 0.1)
 fi
 views=(cam04 cam05)
+surfaces=(cam00 cam02 cam07) # in front, to the side and from above; not fitted to
 quality=draft
 # Without a prior there is nothing to invert: the same number of steps, inversion's among them, all finetune.
 steps=$($bin/python -c 'import sys; from preface.model.fitting.configuration import defaults
@@ -99,8 +101,27 @@ stage "fit" $bin/preface-fit "$out/shards" --prior "$prior" --identity "$fitted"
 stage "fit without a prior" $bin/preface-fit "$out/shards" --prior none --like "$prior" --identity "$fitted" \
     --views "${views[@]}" --quality "$quality" --finetuning.steps "$steps" --output "$out/head-without-prior"
 stage "orbit" $bin/preface-render "$out/head" --orbit 24 --video --no-exr --output "$out/renders"
-stage "evaluation" $bin/preface-evaluate "$out/head" "$out/head-without-prior" --shards "$out/shards" \
+stage "evaluation" $bin/preface-evaluate "$out/head" "$out/head-without-prior" --shards "$out/shards" --images \
     --output "$out/evaluation"
+stage "geometry" $bin/python tools/bench/head_truth.py "$out/head" "$out/head-without-prior" --shards "$out/shards" \
+    --studio "$out" --views "${surfaces[@]}" --pictures "$out/geometry" --json "$out/geometry.json"
+if ! $pretrained; then
+    # What more people give: the same person, placed on the template of the prior that comes with preface.
+    box="the prior in the box"
+    stage "alignment, $box" $bin/preface-align studio "$out/capture" --rig "$out" --only "$fitted" \
+        --template pretrained --landmarks "$out/alignment/landmarks" --output "$out/alignment-pretrained"
+    stage "shards, $box" $bin/preface-build-shards "$out/capture" --rig "$out" \
+        --alignment "$out/alignment-pretrained" --only "$fitted" --resolution "$size" --output "$out/shards-pretrained"
+    stage "fit, $box" $bin/preface-fit "$out/shards-pretrained" --prior pretrained --identity "$fitted" \
+        --views "${views[@]}" --quality "$quality" --output "$out/head-pretrained"
+    stage "orbit, $box" $bin/preface-render "$out/head-pretrained" --orbit 24 --video --no-exr \
+        --output "$out/renders-pretrained"
+    stage "evaluation, $box" $bin/preface-evaluate "$out/head-pretrained" --shards "$out/shards-pretrained" --images \
+        --output "$out/evaluation-pretrained"
+    stage "geometry, $box" $bin/python tools/bench/head_truth.py "$out/head-pretrained" \
+        --shards "$out/shards-pretrained" --studio "$out" --views "${surfaces[@]}" --pictures "$out/geometry" \
+        --json "$out/geometry-pretrained.json"
+fi
 stage "page of the studio" $bin/python tools/show_studio.py "$out" --page studio.html
 $bin/python tools/show_demo.py "$out"
 

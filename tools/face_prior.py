@@ -8,13 +8,13 @@ whole is scaled once so that the mean distance of the irises is the human one.
     python tools/face_prior.py --heads 400
 """
 
-import argparse
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
 from preface.align.keypoints import CANONICAL_KEYPOINTS, SCHEMES
+from preface.cli.usage import Parser
 from preface.geometry import fit_similarity
 from synthetic_studio.eyes import IRIS_RADIUS, Eyeball
 from synthetic_studio.identity import sample_identity
@@ -37,7 +37,7 @@ RIM = {1: (1.0, 0.0), 2: (0.0, 1.0), 3: (-1.0, 0.0), 4: (0.0, -1.0)}
 
 def main() -> None:
     """Sample, align, decompose and write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = Parser(description=__doc__.splitlines()[0])
     parser.add_argument("--heads", type=int, default=400, help="heads to sample")
     count = parser.parse_args().heads
     mirror = SCHEMES["facemesh478"].mirror

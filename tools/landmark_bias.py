@@ -33,6 +33,7 @@ from preface.align.landmarks import ViewLandmarks
 from preface.align.photos.face import face_prior, keypoint_weights
 from preface.artifacts import load_json
 from preface.capture.rig import RigCamera
+from preface.cli.usage import Parser
 from preface.geometry import fit_similarity
 
 OUTPUT = Path(__file__).parents[1] / "preface" / "align" / FILE
@@ -72,9 +73,7 @@ class Samples:
 
 def main() -> None:
     """Gather, hold out, fit, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("studio", type=Path)
     parser.add_argument("--landmarks", type=Path, required=True)
     parser.add_argument("--people", type=int, help="only the first so many (default: all)")

@@ -10,13 +10,13 @@ on one head is not.
     python tools/locate_facemesh_landmarks.py --identities 24
 """
 
-import argparse
 import json
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
+from preface.cli.usage import Parser
 from preface.geometry import Camera, Rigid
 from preface.srgb import encode
 from synthetic_studio.facemesh import detect, look_at
@@ -34,7 +34,7 @@ OUTPUT = Path(__file__).parent / "synthetic_studio" / "facemesh_on_template.json
 
 def main() -> None:
     """Detect, cast back, average and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = Parser(description=__doc__.splitlines()[0])
     parser.add_argument("--identities", type=int, default=24, help="heads to render")
     count = parser.parse_args().identities
     positions = [_positions_on_average(index) for index in tqdm(range(count), desc="heads")]

@@ -6,8 +6,9 @@
 `render` varies samples, precision, levels of the encoding and each shortcut of `preface-render` one at a time, then
 choices of them together, on identities of the first MODEL (a head or a prior) at views that it has not seen; further
 models, which may differ in width, are measured beside it. Per point: PSNR, SSIM and LPIPS (VGG) to the photographs,
-PSNR, opacity and depth against the fullest render (128 128 64 samples or twice its own), CPU time per ray and to
-prepare a head, peak memory above that of the loaded model, and operations of matrix products per ray.
+PSNR, opacity and depth against the fullest render (128 128 64 samples or twice its own), PSNR against the model as
+trained, CPU time per ray and to prepare a head, peak memory above that of the loaded model, and operations of matrix
+products per ray.
 
 `fit` varies steps, rays per step and resolution of `preface-fit`, one at a time; with `--vary quality`, it measures the
 qualities end to end.
@@ -28,6 +29,7 @@ from typing import Any
 from preface.artifacts import ArtifactError, write_bytes
 from preface.cli.folders import make_folder
 from preface.cli.output import exit_status, resumable, say, whole_number
+from preface.cli.usage import Parser
 from preface.model.pretrained import prior_flag
 from preface.model.training.prior_files import read_prior
 from preface.shards import Dataset
@@ -39,9 +41,7 @@ from tradeoff.points import fullest, render_points
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
     render = commands.add_parser("render", help="how heads are rendered")
     render.add_argument("shards", type=Path)

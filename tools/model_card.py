@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from importlib.metadata import metadata, version
 from statistics import fmean
 
+from demo_page.stages import Stage
 from preface.model.training.prior_files import Prior
 from preface.shards.manifest import Manifest
-from show_demo import Stage
 
 # Of metrics.json: what the table shows, where all heads have it.
 FIGURES = {

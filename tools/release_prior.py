@@ -26,8 +26,9 @@ from typing import Any
 
 import tyro
 
+from demo_page.stages import Stage, read_stages
 from model_card import Facts, Result, model_card
-from preface.artifacts import ArtifactError, json_text, load_json, sha256, validate, write_bytes
+from preface.artifacts import ArtifactError, load_json, sha256, validate, write_bytes
 from preface.cli.folders import make_folder
 from preface.cli.output import exit_status, interruptible
 from preface.cli.typed_flags import refusing, told_in_a_line
@@ -36,8 +37,8 @@ from preface.model.pretrained import CARD_FILE, FILES, FOLDER
 from preface.model.training.checkpoint import WEIGHTS, write_checkpoint
 from preface.model.training.folder import TEMPLATE_FILE
 from preface.model.training.prior_files import Prior, prior_payload, read_prior
+from preface.plain_words import json_text
 from preface.shards.manifest import Manifest, read_manifest
-from show_demo import Stage, read_stages
 
 PROGRAM = "release_prior"
 MAX_BYTES = 8_000_000  # of all files; a package is not the place for more

@@ -1,41 +1,59 @@
 """The page of the demo: ``python tools/show_demo.py DIR`` writes ``DIR/report.html`` and its twin.
 
-DIR is what ``tools/demo.sh`` fills. The page shows what came of it: the photographs of a person that the prior has
-never seen, the head that was fitted to them from views that were kept away, beside the same fit without a prior, the
-orbit, the figures; and every command with the time it took, so that it doubles as a tutorial.
+DIR is what ``tools/demo.sh`` fills. The page shows what came of it: the photographs of a person that no prior has seen,
+the heads that were fitted to them, side by side from views that were kept away, their surfaces beside the truth, their
+orbits, the figures; and every command with what came of it and the time it took, so that it doubles as a tutorial.
 """
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tyro
 
-from preface.artifacts import ArtifactError, load_json, provenance, sha256
-from preface.capture.images import read_image
+from bench.head_truth_pictures import DEPTH_ERROR_SHOWN, NORMALS_ERROR_SHOWN
+from demo_page.heads import BASELINE, BOX, HEAD, NONE, OWN, Head, heads_of, prior_of, same_views, words_about
+from demo_page.pictures import geometry_sheet, inputs_sheet, orbit_frames, orbit_sheet, views_sheet
+from demo_page.stages import Stage, read_stages, result_of
+from preface.artifacts import ArtifactError, load_json, provenance
 from preface.cli.output import exit_status
+from preface.cli.render_frames import CAMERAS_FILE, VIDEO_FILE
 from preface.cli.typed_flags import refusing, told_in_a_line
-from preface.model.pretrained import pretrained_folder
-from preface.model.training.prior_files import MODEL_FILE, read_prior
-from preface.reports import KeyFigure, Link, Report, Section, contact_sheet
-from preface.reports.pictures import Picture, as_picture
-from preface.shards import Dataset
+from preface.reports import KeyFigure, Link, Report, Section
 
 PROGRAM = "show_demo"
-HEAD, BASELINE = "head", "head-without-prior"  # folders of the two fits, and their names in the evaluation
 STAGES_FILE = "stages.tsv"
-INPUT_HEIGHT = 288
-STRIP = 6  # frames of the orbit that are shown beside the video
 VIDEO_SIZE = (288, 432)  # CSS pixels
-# Per figure: its name on the page, its unit, and whether more of it is better.
+# Per figure of an evaluation: its column on the page, and its unit.
 FIGURES = {
-    "psnr_face": ("PSNR of the face", "dB", True),
-    "ssim_face": ("SSIM of the face", "", True),
-    "lpips_face": ("LPIPS of the face, VGG", "", False),
-    "psnr": ("PSNR of the whole frame", "dB", True),
+    "psnr_face": ("face PSNR", "dB"),
+    "ssim_face": ("face SSIM", ""),
+    "lpips_face": ("face LPIPS", "VGG"),
+    "psnr": ("frame PSNR", "dB"),
+    "silhouette_iou": ("silhouette", "IoU"),
+}
+SURFACE = {
+    "depth_median_mm": ("depth off", "mm"),
+    "density_normals_median_deg": ("normals off", "°"),
+}
+REPORTS = {
+    "The studio, its people and the truth about them": "studio.html",
+    "Cameras": "rig.report.html",
+    "Cameras of take 0": "rigs/take00.report.html",
+    "Cameras of take 1": "rigs/take01.report.html",
+    "Alignment": "alignment/report.html",
+    "Alignment to the prior in the box": "alignment-pretrained/report.html",
+    "Masks": "shards/masks.html",
+    "Data card of the shards": "shards/README.md",
+    "The prior while it was trained": "prior/validation",
+    "The fit while it ran": "head/previews",
+    "The fit from the prior in the box while it ran": "head-pretrained/previews",
+    "Evaluation, with every figure": "evaluation/report.html",
+    "Evaluation of the head from the prior in the box": "evaluation-pretrained/report.html",
+    "Frames of the orbit": "renders",
+    "Frames of the orbit, the prior in the box": "renders-pretrained",
 }
 
 
@@ -45,15 +63,6 @@ class ShowDemo:
 
     folder: tyro.conf.Positional[Path]
     """What tools/demo.sh filled."""
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A command of the demo, and the seconds that it took, over all runs."""
-
-    name: str
-    seconds: float
-    command: str
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -68,176 +77,171 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def build_report(folder: Path) -> Report:
-    """The whole page."""
-    fit = read_prior(folder / HEAD).fit
-    if fit is None:
-        raise ArtifactError(folder / HEAD, "fit", "is not a head", "Run tools/demo.sh")
-    names = (HEAD, BASELINE)
-    metrics = {name: load_json(folder / "evaluation" / name / "metrics.json") for name in names}
-    inputs = {f"{name}/metrics.json": folder / "evaluation" / name / "metrics.json" for name in names}
+    """The whole page.
+
+    Raises:
+        ArtifactError: the demo has not come to its end in this folder.
+    """
+    heads = heads_of(folder)
+    inputs = {f"{head.name}/metrics.json": head.evaluation / "metrics.json" for head in heads}
     report = Report("A head from two photographs", provenance({}, inputs))
-    _show_result(report.section("Result"), fit, metrics, prior_words(folder, fit))
-    _show_inputs(report.section("What was given"), folder, fit)
-    for name, heading in ((HEAD, "Views that were kept away"), (BASELINE, "The same fit without a prior")):
-        _show_sheet(report.section(heading), folder / "evaluation" / name, name)
-    _show_orbit(report.section("All around"), folder / "renders")
+    views = same_views(heads)
+    _show_result(report.section("Result"), heads, views)
+    _show_inputs(report.section("What was given"), heads[0])
+    _show_views(report.section("Views that were kept away"), heads, views)
+    if all(head.geometry for head in heads):
+        _show_geometry(report.section("The surface, beside the truth"), heads)
+    _show_orbits(report.section("From side to side"), [head for head in heads if head.name != BASELINE])
     _show_stages(report.section("How it was made"), folder)
     return report
 
 
-def prior_words(folder: Path, fit: Mapping[str, Any]) -> str:
-    """Which prior a head was fitted from, as a sentence.
-
-    Raises:
-        ArtifactError: neither the one that was trained here nor the one that comes with preface.
-    """
-    if (folder / "prior" / MODEL_FILE).exists():
-        path, whence = folder / "prior", "was trained here"
-    else:
-        path, whence = pretrained_folder(), "is the one that comes with preface, trained"
-    prior = read_prior(path)
-    if sha256(prior.path) != fit["prior"]:
-        problem = f"is not that of {prior.path}"
-        raise ArtifactError(
-            folder / HEAD, "fit.prior", problem, "Delete the folder, and run tools/demo.sh again"
-        )
-    return (
-        f"The prior {whence} on {len(prior.identities)} people who do not exist, for {prior.steps:,} steps."
-    )
-
-
-def _show_result(
-    section: Section, fit: Mapping[str, Any], metrics: Mapping[str, Mapping[str, Any]], prior: str
-) -> None:
-    count, views = len(fit["views"]), len(metrics[HEAD]["views"])
+def _show_result(section: Section, heads: Sequence[Head], views: Sequence[str]) -> None:
+    fit = heads[0].fit
     section.text(
-        f"""{fit["identity"]} is nobody that the prior was trained on. Its head was fitted to {count} photographs
-        ({", ".join(fit["views"])}) and is measured here on {views} others, beside a model of the same architecture
-        that was trained on the same photographs for as many steps, but from random weights. {prior} Both models are
-        small; more people, more steps and more pixels are what the commands below are for."""
+        f"""{fit["identity"]} is nobody that a prior was trained on. {len(heads)} heads of this person were fitted to
+        the same {len(fit["views"])} photographs ({", ".join(fit["views"])}), and are measured here on {len(views)}
+        others."""
     )
-    means = {name: metrics[name]["mean"] for name in metrics}
-    shown = {key: value for key, value in FIGURES.items() if all(key in mean for mean in means.values())}
-    section.key_figures(
-        [
-            KeyFigure(f"{words}, with the prior", means[HEAD][key], unit)
-            for key, (words, unit, _) in shown.items()
-        ]
+    section.key_figures(_headlines(heads))
+    rows = [_row(head) for head in heads]
+    units = {words: unit for words, unit in (*FIGURES.values(), *SURFACE.values()) if words in rows[0]}
+    section.table(
+        rows, f"Means over {len(views)} views that no head has seen{_measured_surface(heads)}", units=units
     )
-    rows = []
-    for key, (words, unit, more) in shown.items():
-        gain = (means[HEAD][key] - means[BASELINE][key]) * (1 if more else -1)
-        rows.append(
-            {
-                "figure": f"{words}{f', {unit}' if unit else ''}",
-                "with the prior": means[HEAD][key],
-                "without": means[BASELINE][key],
-                "better by": gain,
-            }
+    section.text(explanation(heads))
+
+
+def _headlines(heads: Sequence[Head]) -> list[KeyFigure]:
+    """The PSNR of each face, and what the fit gains by the prior that has its own architecture."""
+    faces = {head.name: head.metrics["mean"].get("psnr_face") for head in heads}
+    if None in faces.values():
+        return [KeyFigure("Views measured", len(heads[0].metrics["views"]))]
+    own = next(head for head in heads if head.name == HEAD)
+    shown = [KeyFigure(f"PSNR of the face, from {h.start}", f"{faces[h.name]:.1f}", "dB") for h in heads]
+    gain = faces[HEAD] - faces[BASELINE]
+    return [*shown, KeyFigure(f"Gained by {own.start}", f"{gain:+.1f}".replace("-", "−"), "dB")]
+
+
+def _row(head: Head) -> dict[str, Any]:
+    """A head's means, with those of its surface where they were measured."""
+    people = None if head.start == NONE else len(prior_of(head).identities)
+    mean = head.metrics["mean"]
+    row = {"fitted from": head.start, "people": people}
+    row |= {words: mean[name] for name, (words, _) in FIGURES.items() if name in mean}
+    surface = head.geometry["mean"] if head.geometry else {}
+    return row | {words: surface[name] for name, (words, _) in SURFACE.items() if name in surface}
+
+
+def _measured_surface(heads: Sequence[Head]) -> str:
+    found = heads[0].geometry
+    return f"; depth and normals: medians, over {', '.join(found['views'])} alone" if found else ""
+
+
+def explanation(heads: Sequence[Head]) -> str:
+    """What the heads were fitted from, and why they differ, in paragraphs."""
+    own = next(head for head in heads if head.name == HEAD)
+    prior = prior_of(own)
+    told = [words_about(prior_of(head), head.start) for head in heads if head.start != NONE]
+    told.append(
+        f"""No prior: the architecture of {own.start}, fitted to the same photographs for as many steps ({own.steps}),
+        but from random weights."""
+    )
+    if own.start == OWN:
+        told.append(
+            f"""Why the head from {OWN} is blurred: {len(prior.identities)} people span few of the ways in which faces
+            differ, so that the code which comes nearest to somebody new is a mixture of them, and {prior.steps:,} steps
+            of a tiny network leave even these people blurred. The {own.fit["finetuning"]["steps"]} steps of finetuning
+            of the quality {own.fit["quality"]} are too few to bring out what two photographs show."""
         )
-    section.table(rows, f"Means over {views} views that neither has seen")
+    if len({head.start for head in heads}) > 2:
+        told.append(
+            f"""Beside it, {BOX} shows what more people, more steps and a larger network give, at the price of a fit. It
+            has a canonical frame of its own, so that the square of the face that is measured is a little another."""
+        )
+    return "\n\n".join(told)
 
 
-def _show_inputs(section: Section, folder: Path, fit: Mapping[str, Any]) -> None:
-    with Dataset(folder / "shards") as dataset:
-        person = dataset.names.index(fit["identity"])
-        cameras = dataset.manifest.identities[person].cameras
-        tiles: list[tuple[Picture | None, str]] = []
-        for name in fit["views"]:
-            pixels = dataset.pixels(person, cameras.index(name)).astype(np.float32) / 255
-            tiles.append((as_picture(pixels[..., :3] * pixels[..., 3:]), name))
-        width, height = dataset.manifest.width, dataset.manifest.height
-    tile = (round(INPUT_HEIGHT * width / height), INPUT_HEIGHT)
+def _show_inputs(section: Section, head: Head) -> None:
+    sheet, (width, height) = inputs_sheet(head)
     section.image(
-        contact_sheet(tiles, len(tiles), tile),
+        sheet,
         f"The photographs at the {width}x{height} pixels that were fitted to, on black by their masks.",
-        f"{len(tiles)} photographs of {fit['identity']}",
+        f"{len(head.fit['views'])} photographs of {head.fit['identity']}",
         "jpeg",
     )
 
 
-def _show_sheet(section: Section, folder: Path, name: str) -> None:
+def _show_views(section: Section, heads: Sequence[Head], views: Sequence[str]) -> None:
     section.image(
-        read_image(folder / "sheet.png"),
-        "By row, one camera: photograph, render, error (black is none, yellow a quarter of full scale), depth, "
-        "normals (red to the subject's left, green up, blue out of the face), opacity.",
-        f"Photographs beside renders of {name} with error, depth, normals and opacity",
+        views_sheet(heads, views),
+        "By row, one camera: the photograph, with its angle at the head to the nearest that was fitted to; the heads, "
+        "with the PSNR of the face; their errors.",
+        f"Photographs beside renders of {len(heads)} heads, and their errors",
         "jpeg",
     )
 
 
-def _show_orbit(section: Section, folder: Path) -> None:
-    frames = sorted(file.stem for file in folder.glob("????.png"))
-    if not frames:
-        raise ArtifactError(folder, "frames", "there are none", "Run tools/demo.sh")
-    try:
-        video = (folder / "orbit.webm").read_bytes()
-    except OSError as error:
-        raise ArtifactError.from_os(folder / "orbit.webm", "reading", error) from error
-    section.video(video, VIDEO_SIZE, f"{len(frames)} frames of an orbit.", "The head turns from side to side")
-    chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, min(STRIP, len(frames))).round().astype(int)]
-    tiles: list[tuple[Picture | None, str]] = []
-    for kind in ("", ".depth", ".normals"):
-        for frame in chosen:
-            tiles.append((as_picture(read_image(folder / f"{frame}{kind}.png")), f"{frame}{kind}"))
-    height, width = tiles[0][0].shape[:2] if tiles[0][0] is not None else (1, 1)
-    size = (round(INPUT_HEIGHT * width / height), INPUT_HEIGHT)
-    section.image(
-        contact_sheet(tiles, len(chosen), size),
-        "Some of its frames: colour, depth, normals.",
-        "Rows of colours, depths and normals around the head",
-        "jpeg",
+def _show_geometry(section: Section, heads: Sequence[Head]) -> None:
+    section.text(
+        """The studio knows the surface behind each pixel. Depth is measured along the camera's axis and normals are
+        derivatives of the density, which show its noise; both are compared where both have a surface. What calibration
+        and alignment got wrong counts, too. Hair is strands here, whose depth jumps from pixel to pixel, and much of
+        the error stands there."""
     )
+    for kind, most in (("depth", f"{DEPTH_ERROR_SHOWN:.0f} mm"), ("normals", f"{NORMALS_ERROR_SHOWN:.0f}°")):
+        section.image(
+            geometry_sheet(heads, kind),
+            f"By row, one camera that no head has seen: the true {kind}, the heads' with the median error, and the "
+            f"errors up to {most}.",
+            f"True {kind} beside those of {len(heads)} heads, and their errors",
+            "jpeg",
+        )
+
+
+def _show_orbits(section: Section, heads: Sequence[Head]) -> None:
+    for head in heads:
+        frames = len(orbit_frames(head.renders))
+        path = head.renders / VIDEO_FILE
+        try:
+            video = path.read_bytes()
+        except OSError as error:
+            raise ArtifactError.from_os(path, "reading", error) from error
+        flags = load_json(head.renders / CAMERAS_FILE)["provenance"]["config"]
+        azimuth, elevation = (float(flags[name]) for name in ("azimuth", "elevation"))
+        section.video(
+            video,
+            VIDEO_SIZE,
+            f"The head from {head.start}, {frames} frames: from side to side, {azimuth:.0f} degrees either way, and "
+            f"{elevation:.0f} up and down.",
+            f"The head from {head.start} turns from side to side",
+        )
+        section.image(
+            orbit_sheet(head.renders),
+            "Some of these frames: colour, depth, normals; below, what the colours mean.",
+            f"Rows of colours, depths and normals of the head from {head.start}",
+            "jpeg",
+        )
 
 
 def _show_stages(section: Section, folder: Path) -> None:
     stages = read_stages(folder / STAGES_FILE)
     total = sum(stage.seconds for stage in stages)
-    rows = [{"stage": stage.name, "time": stage.seconds, "command": stage.command} for stage in stages]
     section.table(
-        rows,
-        f"Every command in order, {total / 60:.1f} minutes in all; a stage that was interrupted counts all its runs",
+        [
+            {"stage": s.name, "time": round(s.seconds), "what came of it": result_of(s.name, folder)}
+            for s in stages
+        ],
+        f"Every stage in order, {total / 60:.1f} minutes in all; of one that ran more than once, its last run",
         units={"time": "s"},
     )
+    section.table(_commands(stages), "And its command, from the checkout, with .venv activated")
     section.text("Each stage has a report or pictures of its own:")
-    reports = {
-        "The studio, its people and the truth about them": "studio.html",
-        "Cameras": "rig.report.html",
-        "Cameras of take 0": "rigs/take00.report.html",
-        "Cameras of take 1": "rigs/take01.report.html",
-        "Alignment": "alignment/report.html",
-        "Masks": "shards/masks.html",
-        "Data card of the shards": "shards/README.md",
-        "The prior while it was trained": "prior/validation",
-        "The fit while it ran": f"{HEAD}/previews",
-        "Evaluation, with every figure": "evaluation/report.html",
-        "Frames of the orbit": "renders",
-    }
-    there = [Link(words, path) for words, path in reports.items() if (folder / path).exists()]
-    section.links(there)
+    section.links([Link(words, path) for words, path in REPORTS.items() if (folder / path).exists()])
 
 
-def read_stages(path: Path) -> Sequence[Stage]:
-    """Read what demo.sh wrote down, lines of NAME, SECONDS and COMMAND; a stage that ran twice is one.
-
-    Raises:
-        ArtifactError: there is no such file, or a line is not of this form.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise ArtifactError.from_os(path, "reading", error) from error
-    found: dict[str, Stage] = {}
-    for number, line in enumerate(lines, 1):
-        name, _, rest = line.partition("\t")
-        seconds, _, command = rest.partition("\t")
-        try:
-            before = found[name].seconds if name in found else 0.0
-            found[name] = Stage(name, before + float(seconds), command)
-        except ValueError as error:
-            problem = f"'{seconds}' is not a number of seconds"
-            raise ArtifactError(path, f"line {number}", problem, "Delete the line") from error
-    return list(found.values())
+def _commands(stages: Sequence[Stage]) -> list[dict[str, Any]]:
+    return [{"stage": stage.name, "command": stage.command} for stage in stages]
 
 
 if __name__ == "__main__":

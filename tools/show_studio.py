@@ -21,21 +21,23 @@ from preface.capture.manifest import Capture, Subject, read_capture
 from preface.capture.rig import Rig, RigCamera, read_rig
 from preface.cli.output import exit_status
 from preface.cli.typed_flags import refusing, told_in_a_line
+from preface.model.rendering.showing import depth_entry, depth_picture, normals_entry, normals_picture
 from preface.reports import (
     KeyFigure,
     Report,
     Section,
-    colorize,
     contact_sheet,
     finite_range,
     overlay_mask_edges,
     overlay_points,
+    with_legend,
 )
 from preface.reports.pictures import GREEN, Picture, as_picture
 
 PROGRAM = "show_studio"
 SHEET_TILE = (192, 288)
 CLOSE_TILE = (360, 540)
+CLOSE_LEGEND = (depth_entry("near", "far, in metres below each picture"), normals_entry())
 CLOSE_CAMERAS = 4  # rows of the close look; the studio numbers its most useful views first
 RED = (255, 90, 80)
 YELLOW = (255, 210, 60)
@@ -178,15 +180,14 @@ def _plain_parameters(head: dict[str, Any]) -> dict[str, Any]:
 def _show_closely(section: Section, studio: Studio, subject: Subject) -> None:
     section.text(
         "Photograph with the five keypoints (red where another surface hides them), photograph with the line "
-        "of half coverage, coverage, depth along the camera's axis, and normals in the rig frame "
-        "(red: subject's left, green: up, blue: out of the face)."
+        "of half coverage, coverage, depth along the camera's axis, and normals in the rig frame."
     )
     rig, cameras = studio.rig(subject.take), [camera.id for camera in studio.capture.manifest.cameras]
     tiles = [
         tile for camera in cameras[:CLOSE_CAMERAS] for tile in close_row(studio, subject.id, camera, rig)
     ]
     section.image(
-        contact_sheet(tiles, columns=5, tile_size=CLOSE_TILE),
+        with_legend(contact_sheet(tiles, columns=5, tile_size=CLOSE_TILE), CLOSE_LEGEND),
         f"{subject.id} from {min(len(cameras), CLOSE_CAMERAS)} cameras, one row each. Click to enlarge.",
         "Rows of photograph with keypoints, mask outline, coverage, depth and normals",
         "jpeg",
@@ -207,9 +208,8 @@ def close_row(studio: Studio, subject: str, camera: str, rig: Rig) -> Iterator[t
     yield overlay_mask_edges(photograph, outline, 2, GREEN), f"{camera} mask outline"
     yield as_picture(coverage), f"{camera} coverage"
     low, high = finite_range(depth, 0, 100)
-    yield colorize(depth, low, high, "viridis"), f"{camera} depth {low:.3f} to {high:.3f} m"
-    normals = studio.normals(subject, camera)
-    yield as_picture(np.where(np.isnan(normals), 0, normals / 2 + 0.5)), f"{camera} normals"
+    yield depth_picture(depth, low, high), f"{camera} depth {low:.3f} to {high:.3f} m"
+    yield normals_picture(studio.normals(subject, camera)), f"{camera} normals"
 
 
 def _with_keypoints(

@@ -20,6 +20,7 @@ from pathlib import Path
 
 from preface.cli.folders import make_folder
 from preface.cli.output import exit_status
+from preface.cli.usage import Parser
 from speed_table import keeping, readme
 from speed_table.stages import SCRIPTS
 
@@ -28,10 +29,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    common = argparse.ArgumentParser(add_help=False)
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    common = Parser(add_help=False)
     common.add_argument("--measured", type=Path, default=ROOT / "tools" / "measured", help="what is kept")
     commands = parser.add_subparsers(required=True)
     keep = commands.add_parser("keep", parents=[common], help="keep a measurement")

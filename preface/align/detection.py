@@ -10,13 +10,13 @@ from itertools import starmap
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from preface.align.face_search import find_landmarks
 from preface.align.facemesh import FaceModels
 from preface.align.landmarks import NoFace, ViewLandmarks
 from preface.artifacts import ArtifactError
 from preface.capture.images import displayable, read_image
+from preface.progress import Progress
 
 View = tuple[str, str]  # subject, camera
 Found = ViewLandmarks | NoFace
@@ -82,10 +82,10 @@ def detect_views(
     """
     options = options or DetectionOptions()
     found: dict[View, Found] = {}
-    with tqdm(total=len(images), desc="looking for faces", unit="image", disable=None) as bar:
+    with Progress(len(images), "images searched for faces") as progress:
         for view, result in _run(images, options, read):
             found[view] = result
-            bar.update()
+            progress.add(1)
             if done is not None:
                 done(view, result)
     return {view: found[view] for view in images}

@@ -7,12 +7,7 @@ solution would find the face again in every crop, with a detector that gives up 
 One `FaceModels` belongs to one process; MediaPipe's graphs survive neither pickling nor a fork.
 """
 
-import contextlib
-import os
 import re
-import sys
-import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from preface.artifacts import ArtifactError
+from preface.capture.chatter import without_chatter
 
 CROP_SIDE = 192  # pixels: the input of the landmark model shipped with mediapipe 0.10.21
 TASK_CROP_SIDE = 384  # pixels: a .task file brings its own detector, and a model of 256 pixels
@@ -98,7 +94,7 @@ class FaceModels:
             FaceModelError: mediapipe is not installed, or the file is no landmark model.
         """
         try:
-            with _without_chatter():
+            with without_chatter(_CHATTER):
                 import mediapipe
 
                 self._detectors = [
@@ -214,20 +210,3 @@ def _shortened(error: Exception) -> str:
 
 def _in_pixels(landmarks: Any, crop: np.ndarray) -> np.ndarray:
     return np.array([(point.x, point.y, point.z) for point in landmarks]) * crop.shape[0]
-
-
-@contextlib.contextmanager
-def _without_chatter() -> Iterator[None]:
-    """Hold back what native code writes to standard error, and pass on all that is not known to be noise."""
-    sys.stderr.flush()
-    with tempfile.TemporaryFile() as held:
-        original = os.dup(2)
-        os.dup2(held.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(original, 2)
-            os.close(original)
-            held.seek(0)
-            lines = held.read().decode(errors="replace").splitlines(keepends=True)
-            sys.stderr.write("".join(line for line in lines if not _CHATTER.match(line)))

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from preface.artifacts import ArtifactError
 from preface.capture.boards import board_in_words, board_points
@@ -35,6 +34,7 @@ from preface.capture.video import (
     read_timestamps,
     read_video_header,
 )
+from preface.progress import Progress
 
 LISTED = 5  # names in a sentence before "and N more"
 AHEAD = 3  # tasks per worker that wait for it; bounds the frames in memory
@@ -172,12 +172,11 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 def _run(tasks: Iterable[_Task], count: int, board: Board, options: DetectionOptions) -> Iterator[_Result]:
     workers = min(options.jobs or len(os.sched_getaffinity(0)), max(count, 1))
-    progress = tqdm(total=count or None, desc="detecting the board", unit="image", disable=None)
-    with progress:
+    with Progress(count, "images searched for the board") as progress:
         if workers == 1 or (count <= FEW and not options.jobs):
             for task in tasks:
                 yield _detect(task, board, options.search_side)
-                progress.update()
+                progress.add(1)
             return
         # Forking a process that runs OpenCV's threads can deadlock.
         context = multiprocessing.get_context("spawn")
@@ -190,12 +189,12 @@ def _run(tasks: Iterable[_Task], count: int, board: Board, options: DetectionOpt
                     done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                     for future in done:
                         yield future.result()
-                        progress.update()
+                        progress.add(1)
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in done:
                     yield future.result()
-                    progress.update()
+                    progress.add(1)
         except BrokenProcessPool as error:
             problem = "a worker process died, most likely for want of memory"
             raise DetectionError("workers", "process", problem, "Run with fewer --jobs") from error

@@ -4,7 +4,6 @@ Observations do not say how they were made. A detector's corners, corners that a
 ``corners.json``, and the projections of a simulation are all the same to the solver.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -80,10 +79,6 @@ class Observations:
             point=self.point[mask],
             pixels=self.pixels[mask],
         )
-
-    def of_frames(self, frames: Sequence[int] | np.ndarray) -> "Observations":
-        """The sightings in some frames, given by index; all cameras, frames and board points stay."""
-        return self.subset(np.isin(self.frame, frames))
 
     def view(self, camera: int, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """What one camera sees in one frame: indices [N] of board points, pixels [N, 2]."""

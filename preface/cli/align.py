@@ -184,13 +184,14 @@ def _add_landmarks(parser: argparse.ArgumentParser, bias: tuple[str, ...], bias_
         "--search-side",
         type=whole_number(64),
         metavar="PIXELS",
-        help="faces are searched for in images reduced to this longer side, and refined at full resolution",
+        help="faces are searched for in images reduced to this longer side, and refined at full resolution "
+        "(default: 512)",
     )
     landmarks.add_argument(
         "--crops",
         type=whole_number(1),
         metavar="N",
-        help="crops, each placed a little differently, whose agreement says how certain a landmark is",
+        help="crops, each placed a little differently, whose agreement says how certain a landmark is (default: 8)",
     )
     landmarks.add_argument(
         "--landmark-bias",

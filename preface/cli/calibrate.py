@@ -169,13 +169,13 @@ def _add_the_model(parser: argparse.ArgumentParser) -> None:
         "--camera-model",
         choices=("auto", *CAMERA_MODELS),
         default="auto",
-        help="auto: the simplest that held-out frames support",
+        help="auto: the simplest that held-out frames support (default: auto)",
     )
     model.add_argument(
         "--board-warp",
         choices=("auto", "on", "off"),
         default="auto",
-        help="whether the board may bow; auto: if held-out frames support it",
+        help="whether the board may bow; auto: if held-out frames support it (default: auto)",
     )
     model.add_argument(
         "--backend", choices=("own", "pycolmap"), default="own", help="who solves (default: own)"
@@ -217,7 +217,7 @@ def _add_what_is_used(parser: argparse.ArgumentParser) -> None:
         type=whole_number(1),
         default=1,
         metavar="N",
-        help="take every N-th frame of videos without timestamps",
+        help="take every N-th frame of videos without timestamps (default: 1)",
     )
     parser.add_argument(
         "--corners",

@@ -59,7 +59,7 @@ class FitCommand(FitConfig):
     checkpoint).
     """
 
-    shards: Annotated[Path, tyro.conf.Positional]
+    shards: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHARDS")]
     """Folder of the shards that hold the views, or of one to seven photographs."""
     views: tuple[str, ...] = ()
     """Names of one to seven cameras; of photographs, their names without suffix, by default all."""
@@ -102,17 +102,31 @@ def parse(arguments: Sequence[str]) -> FitCommand:
 
 
 def is_shards(path: Path) -> bool:
-    """Whether a path is to be read as shards: a file, or a folder with their manifest."""
+    """Whether a path is to be read as shards, a folder with their manifest or the manifest itself, or as photographs.
+
+    Raises:
+        ArtifactError: there is no such folder, or it is another file.
+    """
+    from preface.artifacts import ArtifactError
     from preface.shards.manifest import MANIFEST_FILE
 
-    return not path.is_dir() or (path / MANIFEST_FILE).exists()
+    if path.is_dir():
+        return (path / MANIFEST_FILE).exists()
+    if path.name == MANIFEST_FILE and path.is_file():
+        return True
+    there = path.exists()
+    problem = "is a file, and neither shards nor photographs" if there else "there is no such folder"
+    remedy = "Give the folder of the shards, or one of one to seven photographs of one person"
+    raise ArtifactError(path, "file" if there else "folder", problem, remedy)
 
 
 def _require_no_photographs(command: FitCommand) -> None:
     default = PhotographsConfig()
     for one in fields(PhotographsConfig):
         if getattr(command.photos, one.name) != getattr(default, one.name):
-            raise UsageError(f"--photos.{one.name} is for a folder of photographs, and SHARDS are shards")
+            raise UsageError(
+                f"--photos.{one.name} is for a folder of photographs, and {command.shards} holds shards"
+            )
 
 
 def _fit(config: FitConfig) -> int:

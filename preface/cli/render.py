@@ -78,11 +78,19 @@ def _parser() -> argparse.ArgumentParser:
 def _add_the_orbit(parser: argparse.ArgumentParser) -> None:
     path = parser.add_argument_group("the orbit")
     path.add_argument(
-        "--azimuth", type=number(0, 180), default=40.0, help="degrees to either side, 180: all around"
+        "--azimuth",
+        type=number(0, 180),
+        default=40.0,
+        help="degrees to either side, 180: all around (default: 40)",
     )
-    path.add_argument("--elevation", type=number(-85, 85), default=10.0, help="degrees up and down")
     path.add_argument(
-        "--distance", type=number(1e-3, 1e3), default=1.0, help="metres from the middle of the box"
+        "--elevation", type=number(-85, 85), default=10.0, help="degrees up and down (default: 10)"
+    )
+    path.add_argument(
+        "--distance",
+        type=number(1e-3, 1e3),
+        default=1.0,
+        help="metres from the middle of the box (default: 1)",
     )
 
 
@@ -92,7 +100,7 @@ def _add_what_is_written(parser: argparse.ArgumentParser) -> None:
         "--size", type=size, metavar="WxH", help="of an orbit's images (default: those of training)"
     )
     image.add_argument(
-        "--background", type=number(0, 1), default=0.0, help="grey value behind the head, 0 to 1"
+        "--background", type=number(0, 1), default=0.0, help="grey value behind the head, 0 to 1 (default: 0)"
     )
     image.add_argument("--no-normals", action="store_true", help="save the time that normals take")
     image.add_argument("--no-exr", action="store_true", help="PNG only")
@@ -104,14 +112,14 @@ def _add_what_is_written(parser: argparse.ArgumentParser) -> None:
         type=whole_number(2),
         default=256,
         metavar="N",
-        help="voxels along the box's longest side",
+        help="voxels along the box's longest side (default: %(default)s)",
     )
     mesh.add_argument(
         "--surface",
         type=number(1e-3, 0.999),
         default=0.5,
         metavar="OPACITY",
-        help="the surface is where a centimetre stops this share of the light",
+        help="the surface is where a centimetre stops this share of the light (default: %(default)s)",
     )
 
 

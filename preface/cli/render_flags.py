@@ -12,9 +12,13 @@ from preface.model.rendering.shortcuts import DEFAULT_QUALITY, QUALITIES, Shortc
 
 def add_device_flags(group: argparse._ArgumentGroup) -> None:
     """Add ``--device`` and ``--rays-at-a-time``."""
-    group.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
+    group.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N (default: cpu)")
     group.add_argument(
-        "--rays-at-a-time", type=whole_number(1), default=4096, metavar="N", help="memory goes with it"
+        "--rays-at-a-time",
+        type=whole_number(1),
+        default=4096,
+        metavar="N",
+        help="memory goes with it (default: %(default)s)",
     )
 
 

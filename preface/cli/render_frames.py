@@ -2,8 +2,9 @@
 
 import argparse
 import math
+import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from preface.align.person_file import read_alignment
-from preface.artifacts import ArtifactError, load_json, provenance
+from preface.align.person_file import Alignment, read_alignment
+from preface.artifacts import ArtifactError, load_json, provenance, sha256
+from preface.capture.chatter import without_chatter
+from preface.capture.folders import DEFAULT_TAKE
 from preface.capture.formats import read_rig_from
 from preface.capture.images import IMAGE_SUFFIXES, write_exr, write_png
 from preface.capture.rig import Rig, RigCamera, read_rig, write_rig
@@ -31,15 +34,21 @@ from preface.model.rendering.image import RenderedImage, RenderRays, Space, rend
 from preface.model.rendering.mesh import MESH_SUFFIXES, extract_mesh, model_field, voxel_side, write_mesh
 from preface.model.rendering.paths import framing_camera, on_sphere, orbit
 from preface.model.rendering.shortcuts import Shortcuts, accelerate
-from preface.model.rendering.showing import normals_picture
+from preface.model.rendering.showing import depth_entry, depth_picture, normals_entry, normals_picture
 from preface.model.training.prior_files import Prior, read_prior
 from preface.plain_words import suggestion
-from preface.reports.pictures import Picture, as_picture, colorize
+from preface.reports.pictures import Picture, as_picture, legend
 from preface.shards.writer import box_depths
 
-CAMERAS_FILE, VIDEO_FILE = "rig.json", "orbit.webm"
+CAMERAS_FILE, VIDEO_FILE, LEGEND_FILE = "rig.json", "orbit.webm", "legend.png"
+LEGEND_WIDTH = 720  # pixels
 CANONICAL = "canonical"  # the take of the cameras that were written here
 FRAMES_PER_SECOND = 24
+ALPHA = ".alpha.png"  # every frame has one
+# Settings of where things are written, of how it is computed, and of the mesh, which has a file of its own.
+NOT_OF_THE_FRAMES = ("output", "device", "rays_at_a_time", "mesh", "mesh_resolution", "surface")
+# WebM names its codecs without four letters, of which OpenCV wants some, and says so whichever they are.
+VIDEO_CHATTER = re.compile("OpenCV: FFMPEG: tag 0x30395056/'VP90' is not supported with codec id")
 SECONDS_BETWEEN = 10.0  # between two lines about one image
 
 
@@ -58,9 +67,11 @@ def _rendered(config: argparse.Namespace) -> list[str]:
     space = space_of(prior)
     box = space.box
     frames = _cameras(config, prior, box)
+    depths = _depths(frames, box)
     codes = _codes(config, prior, len(frames))
     model = prior.load_model().to(device)
-    _require_place(config.output)
+    settings = {key: str(value) for key, value in vars(config).items() if value is not None}
+    _require_place(config.output, frames, settings)
     require_writable(config.output)
     meshed = _mesh(config, model, space, codes[0]) if config.mesh is not None else []
     if shortcuts != Shortcuts():  # exact to rounding, but what is fastest may differ from run to run
@@ -78,11 +89,11 @@ def _rendered(config: argparse.Namespace) -> list[str]:
             device=device,
             progress=progress.rows,
         )
-        picture = _write(config.output, name, image, box, pose, exr=not config.no_exr)
+        picture = _write(config.output, name, image, depths, exr=not config.no_exr)
         if video is not None:
             video.add(picture)
         progress.finished(camera)
-    settings = {key: str(value) for key, value in vars(config).items() if value is not None}
+    _write_legend(config.output, depths, normals=not config.no_normals)
     cameras = {name: RigCamera.at(camera, pose.inverse) for name, (camera, pose) in frames.items()}
     history = provenance(settings, {"model.json": prior.path})
     written = write_rig(config.output / CAMERAS_FILE, Rig(CANONICAL, cameras, provenance=history))
@@ -90,21 +101,49 @@ def _rendered(config: argparse.Namespace) -> list[str]:
     return [*meshed, *lines, str(written)]
 
 
-def _require_place(folder: Path) -> None:
+def _require_place(folder: Path, frames: Iterable[str], settings: Mapping[str, str]) -> None:
     """Refuse a folder with others' pictures, which these would join or replace, or with the rig of a capture.
+
+    Pictures of the same command are replaced; those of another one would be half replaced.
+
+    Args:
+        folder: to write to; need not exist.
+        frames: names of what is rendered.
+        settings: of the command, as its rig says them.
 
     Raises:
         ArtifactError: naming what is there.
     """
     cameras = folder / CAMERAS_FILE
-    if cameras.is_file() and load_json(cameras).get("take") == CANONICAL:
-        return
-    require_own(
-        folder,
-        "renders",
-        ("*.alpha.png",),
-        lambda entry: entry.name == CAMERAS_FILE or entry.suffix.lower() in IMAGE_SUFFIXES,
-    )
+    remedy = "Choose another --output, or empty this folder"
+    earlier = load_json(cameras) if cameras.is_file() else {}
+    if earlier.get("take") == CANONICAL:
+        now = _of_the_frames(settings)
+        before = _of_the_frames((earlier.get("provenance") or {}).get("config", {}))
+        different = [name for name in sorted(now.keys() | before.keys()) if now.get(name) != before.get(name)]
+        if different:
+            said = (f"{n} is {_said(before.get(n))} there and {_said(now.get(n))} now" for n in different)
+            raise ArtifactError(folder, "folder", f"holds another render: {'; '.join(said)}", remedy)
+    else:
+        require_own(
+            folder,
+            "renders",
+            (f"*{ALPHA}",),
+            lambda entry: entry.name == CAMERAS_FILE or entry.suffix.lower() in IMAGE_SUFFIXES,
+        )
+    others = sorted({file.name.removesuffix(ALPHA) for file in folder.glob(f"*{ALPHA}")} - set(frames))
+    if others:
+        some = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")
+        raise ArtifactError(folder, "folder", f"holds frames of another render ({some})", remedy)
+
+
+def _said(setting: str | None) -> str:
+    return {None: "not given", "True": "on", "False": "off"}.get(setting, str(setting))
+
+
+def _of_the_frames(settings: Mapping[str, str]) -> dict[str, str]:
+    """The settings that frames depend on, beyond rounding."""
+    return {name: value for name, value in settings.items() if name not in NOT_OF_THE_FRAMES}
 
 
 def _renderers(
@@ -195,23 +234,51 @@ def _cameras(config: argparse.Namespace, prior: Prior, box: Box) -> dict[str, tu
 def _given_cameras(config: argparse.Namespace) -> dict[str, tuple[Camera, Rigid]]:
     if config.size is not None:
         raise UsageError("--size is that of an orbit; the cameras of --cameras have sizes of their own")
-    rig = _rig(config.cameras)
+    rig, file = _rig(config.cameras)
     poses = {name: camera.camera_from_rig.inverse for name, camera in rig.cameras.items()}
     if config.alignment is not None:
-        carry = read_alignment(config.alignment).placement.canonical_from_rig.apply_to_pose
+        person = read_alignment(config.alignment)
+        if file is not None:
+            _require_its_take(file, rig, config.alignment, person)
+        carry = person.placement.canonical_from_rig.apply_to_pose
         poses = {name: carry(pose) for name, pose in poses.items()}
+    if (taken := Path(LEGEND_FILE).stem) in poses:
+        problem = f"'{taken}' is the name of another file of the renders"
+        raise ArtifactError(config.cameras, "cameras", problem, "Rename this camera")
     return {name: (rig.cameras[name].camera, pose) for name, pose in poses.items()}
 
 
-def _rig(path: Path) -> Rig:
-    """A rig of ours, or of a format that preface-calibrate imports."""
+def _require_its_take(file: Path, rig: Rig, alignment: Path, person: Alignment) -> None:
+    """Refuse a rig of another take than the one that a person was aligned in: each has a frame of its own.
+
+    A take that has no name of its own says nothing, and a rig that the person was aligned with is right by any name.
+
+    Raises:
+        ArtifactError: naming both takes, and the rig to use.
+    """
+    if rig.take == person.take or DEFAULT_TAKE in (rig.take, person.take):
+        return
+    if (person.provenance or {}).get("inputs", {}).get(f"rigs/{person.take}.json") == sha256(file):
+        return
+    problem = f"is '{rig.take}', and {alignment} was made in take '{person.take}'"
+    if rig.take == CANONICAL:
+        remedy = "These cameras are in the canonical frame: leave --alignment away"
+    else:
+        its = file.with_name(f"{person.take}.json")  # as preface-calibrate names them
+        remedy = f"Give the rig of take '{person.take}'{f', {its}' if its.is_file() else ''}"
+    raise ArtifactError(file, "take", problem, remedy)
+
+
+def _rig(path: Path) -> tuple[Rig, Path | None]:
+    """A rig of ours and its file, or one of a format that preface-calibrate imports, which knows no takes."""
     try:
-        return read_rig(one_rig_file(path))
+        file = one_rig_file(path)
+        return read_rig(file), file
     except ArtifactError as error:
         if path.match("rig*.json") or any(path.glob("rigs/*.json")):
             raise
         try:
-            return read_rig_from(path)
+            return read_rig_from(path), None
         except ArtifactError as other:
             raise other from error
 
@@ -244,13 +311,28 @@ def _index(prior: Prior, name: str) -> int:
 # ------------------------------------------------------------------------------------- the files
 
 
-def _write(folder: Path, name: str, image: RenderedImage, box: Box, pose: Rigid, *, exr: bool) -> Picture:
+def _depths(frames: Mapping[str, tuple[Camera, Rigid]], box: Box) -> tuple[float, float]:
+    """Metres between which the box lies before all the cameras: a colour is then the same depth in every picture."""
+    corners = np.stack([box.minimum, box.maximum])
+    ends = np.array([box_depths(corners, pose.matrix[:3]) for _, pose in frames.values()])
+    return float(ends[:, 0].min()), float(ends[:, 1].max())
+
+
+def _write_legend(folder: Path, depths: tuple[float, float], *, normals: bool) -> None:
+    """Write what the colours of the pictures of depth and normals mean."""
+    near, far = (f"{depth:.2f} m" for depth in depths)
+    entries = [depth_entry(f"{near} in front of the camera", far), *([normals_entry()] if normals else [])]
+    write_png(folder / LEGEND_FILE, legend(entries, LEGEND_WIDTH))
+
+
+def _write(
+    folder: Path, name: str, image: RenderedImage, depths: tuple[float, float], *, exr: bool
+) -> Picture:
     """Write a frame's files; returns the colours as shown."""
     picture = as_picture(image.rgb)
     write_png(folder / f"{name}.png", picture)
-    write_png(folder / f"{name}.alpha.png", np.rint(image.alpha * 255).astype(np.uint8))
-    near, far = box_depths(np.stack([box.minimum, box.maximum]), pose.matrix[:3])
-    write_png(folder / f"{name}.depth.png", colorize(image.depth, near, far, "viridis"))
+    write_png(folder / f"{name}{ALPHA}", np.rint(image.alpha * 255).astype(np.uint8))
+    write_png(folder / f"{name}.depth.png", depth_picture(image.depth, *depths))
     channels: dict[str, Any] = {"Z": image.depth}
     if image.normals is not None:
         write_png(folder / f"{name}.normals.png", normals_picture(image.normals))
@@ -277,7 +359,8 @@ class _Video:
             codec = cv2.VideoWriter.fourcc(*"VP90")
             partial = self._partial.with_name(f"{self._partial.name}.partial.webm")
             self._partial = partial
-            self._writer = cv2.VideoWriter(str(partial), codec, FRAMES_PER_SECOND, size)
+            with without_chatter(VIDEO_CHATTER):
+                self._writer = cv2.VideoWriter(str(partial), codec, FRAMES_PER_SECOND, size)
             if not self._writer.isOpened():
                 raise ArtifactError(
                     self._path, "video", "cannot be written", "Check the folder, or omit --video"

@@ -103,13 +103,3 @@ def camera_from_colmap(model: str, width: int, height: int, params: np.ndarray) 
             "with --ImageReader.camera_model OPENCV"
         )
     return Camera(model, width, height, params)
-
-
-def pose_from_colmap(quaternion_wxyz: np.ndarray, translation: np.ndarray) -> Rigid:
-    """Build camera_from_world from QW QX QY QZ TX TY TZ of COLMAP's images.txt."""
-    return Rigid.from_quaternion(quaternion_wxyz, translation)
-
-
-def pose_to_colmap(camera_from_world: Rigid) -> tuple[np.ndarray, np.ndarray]:
-    """Return QW QX QY QZ and TX TY TZ of COLMAP's images.txt."""
-    return camera_from_world.quaternion_wxyz, camera_from_world.translation.copy()

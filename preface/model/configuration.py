@@ -53,7 +53,7 @@ class ModelConfig:
     """Levels of the direction's encoding, to which the direction itself is appended. The paper: 4."""
     levels: int | Literal["auto"] = 12
     """Levels of the position's encoding, in both networks, 0 to 16, or `auto`: those that the sharpest
-    photograph can carry (see `carried_levels`). The paper: 12."""
+    photograph can carry, as its pixels average finer waves away. The paper: 12."""
     samples: tuple[int, ...] = (256, 256, 128)
     """Intervals per ray in each round; the last round is the NeRF network's. The paper: 256, 256, 128."""
     dilation_bias: float = 0.0025

@@ -3,7 +3,7 @@
 Shared by every command that shows results. It knows images, numbers and words, not what they mean: no
 cameras, no faces, no networks.
 
-- :mod:`preface.reports.pictures` turns arrays into pictures: contact sheets, heat maps, overlays.
+- :mod:`preface.reports.pictures` turns arrays into pictures: contact sheets, legends, heat maps, overlays.
 - :mod:`preface.reports.plots` makes matplotlib figures without a display and encodes them.
 - :mod:`preface.reports.page` collects sections into a :class:`Report` and writes ``NAME.html`` and
   ``NAME.json``.
@@ -23,9 +23,12 @@ from preface.reports.pictures import (
     colorize,
     contact_sheet,
     finite_range,
+    gradient,
     heat_map,
+    legend,
     overlay_mask_edges,
     overlay_points,
+    with_legend,
 )
 from preface.reports.plots import new_figure
 from preface.reports.values import Target
@@ -39,8 +42,11 @@ __all__ = [
     "colorize",
     "contact_sheet",
     "finite_range",
+    "gradient",
     "heat_map",
+    "legend",
     "new_figure",
     "overlay_mask_edges",
     "overlay_points",
+    "with_legend",
 ]

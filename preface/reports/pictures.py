@@ -17,6 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 Picture = NDArray[np.uint8]
 Color = tuple[int, int, int]
+LegendEntry = tuple[str, Picture, str]  # a sample of colours between the words before and after it
 
 SHEET_BACKGROUND: Color = (32, 33, 36)
 TILE_BACKGROUND: Color = (18, 18, 20)
@@ -94,6 +95,44 @@ def contact_sheet(
             middle = left + width / 2, top + height + line * _line_height(font)
             draw.text(middle, text, CAPTION_COLOR, font, anchor="ma")
     return np.array(sheet)
+
+
+def with_legend(sheet: Picture, entries: Sequence[LegendEntry]) -> Picture:
+    """A sheet with what its colours mean below it, as :func:`legend` draws it."""
+    return stacked(sheet, legend(entries, sheet.shape[1]))
+
+
+def stacked(above: Picture, below: Picture) -> Picture:
+    """One picture above another; the narrower one has background to its right."""
+    width = max(above.shape[1], below.shape[1])
+    return np.concatenate([_widened(above, width), _widened(below, width)])
+
+
+def legend(entries: Sequence[LegendEntry], width: int) -> Picture:
+    """Samples of colours with their words, side by side on as few rows as ``width`` pixels allow.
+
+    An entry that is wider than that has a row for itself, and the legend is as wide as this needs.
+    """
+    font = _font(max(SMALLEST_FONT, min(18, width // 70)))
+    drawn = [_legend_entry(entry, font) for entry in entries]
+    rows: list[list[Picture]] = []
+    for picture in drawn:
+        used = sum(other.shape[1] for other in rows[-1]) if rows else 0
+        if rows and used + picture.shape[1] <= width:
+            rows[-1].append(picture)
+        else:
+            rows.append([picture])
+    across = max(width, *(sum(picture.shape[1] for picture in row) for row in rows))
+    lines = []
+    for row in rows:
+        height = max(picture.shape[0] for picture in row)
+        lines.append(_widened(np.concatenate([_heightened(p, height) for p in row], axis=1), across))
+    return np.concatenate(lines)
+
+
+def gradient(colormap: str, width: int, height: int) -> Picture:
+    """All colours of a matplotlib map, the lowest at the left."""
+    return colorize(np.linspace(0, 1, width)[None].repeat(height, 0), 0, 1, colormap)
 
 
 def colorize(values: NDArray[Any], low: float, high: float, colormap: str) -> Picture:
@@ -264,6 +303,37 @@ def _circle(picture: Picture, x: float, y: float, radius: float, color: Color, t
     """An anti-aliased circle at sub-pixel places; OpenCV counts from pixel centres and in 1/16 pixel."""
     centre = round((x - 0.5) * 16), round((y - 0.5) * 16)
     cv2.circle(picture, centre, round(radius * 16), color, thickness, cv2.LINE_AA, shift=4)
+
+
+def _legend_entry(entry: LegendEntry, font: ImageFont.FreeTypeFont) -> Picture:
+    before, sample, after = entry
+    widths = [int(np.ceil(font.getlength(words))) for words in (before, after)]
+    height = max(sample.shape[0], _line_height(font)) + 2 * GAP
+    left = GAP + (widths[0] + GAP if before else 0)
+    drawn = Image.new("RGB", (left + sample.shape[1] + GAP + widths[1] + 3 * GAP, height), SHEET_BACKGROUND)
+    drawn.paste(Image.fromarray(sample), (left, (height - sample.shape[0]) // 2))
+    draw = ImageDraw.Draw(drawn)
+    draw.text((GAP, height / 2), before, CAPTION_COLOR, font, anchor="lm")
+    draw.text((left + sample.shape[1] + GAP, height / 2), after, CAPTION_COLOR, font, anchor="lm")
+    return np.array(drawn)
+
+
+def _widened(picture: Picture, width: int) -> Picture:
+    """With background to the right."""
+    return _padded(picture, 0, width - picture.shape[1])
+
+
+def _heightened(picture: Picture, height: int) -> Picture:
+    """With background above and below."""
+    return _padded(picture, height - picture.shape[0], 0)
+
+
+def _padded(picture: Picture, rows: int, columns: int) -> Picture:
+    height, width = picture.shape[:2]
+    canvas = np.empty((height + rows, width + columns, 3), np.uint8)
+    canvas[:] = SHEET_BACKGROUND
+    canvas[rows // 2 : rows // 2 + height, :width] = picture
+    return canvas
 
 
 @cache

@@ -17,13 +17,13 @@ import numpy as np
 
 from preface.artifacts import (
     ArtifactError,
-    json_text,
     json_types,
     load_json,
     resolve_inside,
     validate,
     write_bytes,
 )
+from preface.plain_words import json_text
 from preface.shards.checksums import NO_DIGEST, text_digest
 from preface.shards.format import PIXEL_ORDERS, PixelOrder, shard_name
 

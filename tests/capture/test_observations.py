@@ -28,7 +28,7 @@ def test_counts_and_views_tell_who_sees_what():
 
 
 def test_a_part_keeps_the_numbering():
-    part = SEEN.of_frames([2])
+    part = SEEN.subset(SEEN.frame == 2)
     assert len(part) == 2
     assert part.frame_ids == SEEN.frame_ids
     assert part.counts.tolist() == [[0, 0, 0], [0, 0, 2]]

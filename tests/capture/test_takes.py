@@ -61,12 +61,11 @@ def test_takes_without_a_common_camera_have_no_drift(small_calibration):
 
 
 def test_takes_keep_their_order_and_agree(small_scene):
-    frames = np.arange(14)
     observations = small_scene.observations
     takes = {
-        "morning": observations.of_frames(frames[:-1]),
+        "morning": observations.subset(observations.frame < 13),
         "noon": observations,
-        "evening": observations.of_frames(frames[1:]),
+        "evening": observations.subset((observations.frame > 0) & (observations.frame < 14)),
     }
     found = calibrate_takes(takes, PLAIN)
     assert list(found) == ["morning", "noon", "evening"]
@@ -77,7 +76,7 @@ def test_takes_keep_their_order_and_agree(small_scene):
 
 def test_an_error_names_the_take(small_scene):
     observations = small_scene.observations
-    takes = {"good": observations, "short": observations.of_frames([0, 1])}
+    takes = {"good": observations, "short": observations.subset(observations.frame < 2)}
     with pytest.raises(CalibrationError, match=r"^take 'short': camera 'C0\d'"):
         calibrate_takes(takes, PLAIN)
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from preface.align.detection import DetectionOptions
 from preface.align.keypoints import CANONICAL_KEYPOINTS, IBUG68
 from preface.align.landmark_files import landmark_file, write_landmarks
 from preface.align.report import alignment_report
@@ -406,6 +407,15 @@ def test_wrong_usage_ends_with_2(arguments, capsys):
     assert line.startswith("preface-align")
     assert ": error: " in line
     assert line.endswith(" --help")
+
+
+def test_help_says_what_the_detector_does_unless_it_is_told(capsys):
+    usual = DetectionOptions()
+    with pytest.raises(SystemExit, match="0"):
+        main(["studio", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert re.search(rf"--search-side PIXELS [^-]*\(default: {usual.scale}\)", said)
+    assert re.search(rf"--crops N [^-]*\(default: {usual.jitters}\)", said)
 
 
 def test_help_comes_at_once():

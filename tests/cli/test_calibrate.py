@@ -296,7 +296,7 @@ def test_an_output_that_cannot_be_written_is_told_before_boards_are_searched_for
 
 
 def test_too_few_frames_name_the_capture_and_the_camera(capture, tmp_path, observations, capsys):
-    few = write_corners(tmp_path / "few.json", Corners("monday", observations.of_frames([0, 1])))
+    few = write_corners(tmp_path / "few.json", Corners("monday", observations.subset(observations.frame < 2)))
     given = ["--corners", few, "--take", "monday", "--output", tmp_path / "rig.json", *PLAIN]
     assert run("board", capture, *given) == 1
     problem = capsys.readouterr().err

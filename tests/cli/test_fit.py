@@ -74,10 +74,27 @@ def test_a_folder_of_neither_kind_is_refused(tmp_path, capsys):
     assert status_of([tmp_path]) == 1
     told = f"{tmp_path}: folder: holds neither shards (manifest.json) nor photographs"
     assert capsys.readouterr().err.startswith(told)
-    assert status_of([tmp_path / "gone", "--views", "a", "--prior", "none"]) == 1
     (tmp_path / "subjects").mkdir()
     assert status_of([tmp_path]) == 1
     assert "is a capture" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("gone", "folder: there is no such folder"), ("me.jpg", "file: is a file, and neither")],
+)
+def test_what_is_no_folder_is_said_to_be_none_whatever_else_is_missing(tmp_path, capsys, name, words):
+    (tmp_path / "me.jpg").touch()
+    for more in ([], ["--views", "a", "--prior", "none"]):
+        assert status_of([tmp_path / name, *more]) == 1
+        told = capsys.readouterr().err
+        assert told.startswith(f"{tmp_path / name}: {words}")
+        assert "one of one to seven photographs" in told
+
+
+def test_shards_may_be_given_by_their_manifest(balls, tmp_path, capsys):
+    assert status_of([balls / "manifest.json", "--prior", "none", "--output", tmp_path / "h"]) == 2
+    assert "--views: 0 cameras" in capsys.readouterr().err
 
 
 def test_a_head_is_fitted_and_its_path_printed_last(balls, tmp_path, capsys):

@@ -83,7 +83,9 @@ def test_people_who_were_placed_elsewhere_than_its_own_are_told_of(box, shards, 
         assert "another template" not in capsys.readouterr().err
         write_template(shards / "template.json", type(moved)(**{**vars(moved), "keypoints": shifted}))
         assert fit.main(fit_words(shards, tmp_path / "moved")) == 0
-        assert "another template than the prior's, 6.3 mm away" in capsys.readouterr().err
+        told = capsys.readouterr().err
+        assert "another template than the prior's, 6.3 mm away" in told
+        assert "preface-align studio CAPTURE --rig RIG --template pretrained" in told
     finally:
         (shards / "template.json").unlink()
 

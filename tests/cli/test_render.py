@@ -1,6 +1,7 @@
 """``preface-render`` as a user runs it, on a prior of ball-shaped heads that was hardly trained."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,14 +9,17 @@ import numpy as np
 import open3d as o3d
 import pytest
 
+from preface.artifacts import load_json, provenance, sha256, write_artifact
 from preface.capture.images import read_exr, read_image
-from preface.capture.rig import read_rig
+from preface.capture.rig import Rig, RigCamera, read_rig, write_rig
 from preface.cli.render import main
 from preface.cli.train import main as train
+from preface.geometry import Camera, Rigid
 from preface.model.training.prior_files import read_prior
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model" / "training"))
 
+SPECS = Path(__file__).parents[2] / "data_specs"
 STEPS = ["--steps", "20", "--identities", "3", "--views", "2", "--rays", "32"]
 
 
@@ -31,7 +35,7 @@ def prior(tmp_path_factory) -> Path:
     return folder
 
 
-def names(prior: Path) -> list[str]:
+def names(prior: Path | str) -> list[str]:
     return list(read_prior(prior).identities)
 
 
@@ -54,6 +58,7 @@ def test_one_image_from_the_front_with_everything_known_of_it(prior, tmp_path, c
         "front.exr",
         "front.normals.png",
         "front.png",
+        "legend.png",
         "rig.json",
     ]
     channels = read_exr(tmp_path / "out" / "front.exr")
@@ -80,7 +85,38 @@ def test_cameras_that_were_written_render_the_same_images(prior, tmp_path):
         assert np.abs(difference).max() <= 1
 
 
-def test_codes_go_from_one_identity_to_another_and_a_video_has_every_frame(prior, tmp_path):
+def test_a_colour_of_depth_is_the_same_depth_in_every_picture(tmp_path):
+    """From cameras at other distances: the legend beside the pictures has one scale."""
+    model = ["pretrained", "--identity", names("pretrained")[0], "--quality", "draft", "--no-normals"]
+    cameras = {}
+    for name, distance in (("close", "0.9"), ("away", "1.1")):
+        how = ["--size", "8x12", "--distance", distance, "--output", str(tmp_path / name)]
+        assert main([*model, *how]) == 0
+        cameras[name] = read_rig(tmp_path / name).cameras["front"]
+    (tmp_path / "both").mkdir()
+    write_rig(tmp_path / "both" / "rig.json", replace(read_rig(tmp_path / "close"), cameras=cameras))
+    out = tmp_path / "out"
+    assert main([*model, "--cameras", str(tmp_path / "both" / "rig.json"), "--output", str(out)]) == 0
+    depth = np.concatenate([read_exr(out / f"{name}.exr")["Z"].ravel() for name in cameras])
+    colour = np.concatenate([read_image(out / f"{name}.depth.png").reshape(-1, 3) for name in cameras])
+    seen = ~np.isnan(depth)
+    assert np.ptp(depth[seen]) > 0.2
+    brightness = (colour[seen] @ [0.3, 0.59, 0.11])[np.argsort(depth[seen])]
+    assert (np.diff(brightness) > -1).all()
+    assert brightness[-1] > brightness[0] + 20
+
+
+def test_a_camera_may_not_have_the_name_of_the_legend(prior, tmp_path, capsys):
+    who = [str(prior), "--identity", names(prior)[0], "--no-normals"]
+    assert main([*who, "--size", "4x6", "--output", str(tmp_path / "one")]) == 0
+    rig = read_rig(tmp_path / "one")
+    write_rig(tmp_path / "rig.json", replace(rig, cameras={"legend": rig.cameras["front"]}))
+    assert main([*who, "--cameras", str(tmp_path / "rig.json"), "--output", str(tmp_path / "out")]) == 1
+    assert "'legend' is the name of another file" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_codes_go_from_one_identity_to_another_and_a_video_has_every_frame(prior, tmp_path, capfd):
     one, other = names(prior)[:2]
     out = tmp_path / "out"
     arguments = ["--orbit", "3", "--size", "16x24", "--no-exr", "--no-normals", "--video", "--azimuth", "0"]
@@ -109,6 +145,7 @@ def test_codes_go_from_one_identity_to_another_and_a_video_has_every_frame(prior
     )
     np.testing.assert_array_equal(read_image(out / "0002.png"), read_image(tmp_path / "b" / "0002.png"))
     assert (read_image(out / "0000.png") != read_image(out / "0002.png")).any()
+    assert "OpenCV" not in capfd.readouterr().err
     video, frames = cv2.VideoCapture(str(out / "orbit.webm")), 0
     while video.read()[0]:
         frames += 1
@@ -209,6 +246,66 @@ def test_a_folder_of_renders_is_rendered_into_again_also_after_an_interruption(p
     assert main(arguments) == 0
     (tmp_path / "rig.json").unlink()
     assert main(arguments) == 0
+
+
+def test_a_folder_with_frames_of_another_render_is_left_alone(prior, tmp_path, capsys):
+    def render(*more):
+        words = ["--size", "8x12", "--no-normals", "--no-exr", "--output", str(tmp_path), *more]
+        return main([str(prior), "--identity", names(prior)[0], *words])
+
+    assert render("--orbit", "2") == 0
+    there = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    capsys.readouterr()
+    assert render("--orbit", "1", "--video") == 1
+    told = capsys.readouterr().err
+    assert "holds another render: orbit is 2 there and 1 now; video is off there and on now" in told
+    assert "Choose another --output" in told
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == there
+    assert render("--orbit", "2", "--rays-at-a-time", "50", "--mesh-resolution", "9") == 0  # the same frames
+    (tmp_path / "rig.json").unlink()  # as after an interruption
+    capsys.readouterr()
+    assert render() == 1
+    assert "holds frames of another render (0000, 0001)" in capsys.readouterr().err
+
+
+def test_a_rig_of_another_take_than_the_alignments_is_refused(prior, tmp_path, capsys):
+    alignment = tmp_path / "alignment.json"
+    alignment.write_text((SPECS / "alignment.example.json").read_text())
+    (tmp_path / "rigs").mkdir()
+    who = [
+        str(prior),
+        "--identity",
+        names(prior)[0],
+        "--no-normals",
+        "--no-exr",
+        "--alignment",
+        str(alignment),
+    ]
+
+    def render(take, rig, of_person=None):
+        lens = Camera("PINHOLE", 4, 6, np.array([8.0, 8.0, 2.0, 3.0]))
+        pose = Rigid(np.eye(3), np.array([0.0, 0.0, 0.6]))
+        written = write_rig(tmp_path / "rigs" / rig, Rig(take, {"only": RigCamera.at(lens, pose)}))
+        content = load_json(alignment)
+        inputs = {f"rigs/{content['take']}.json": of_person or sha256(written)}
+        content["provenance"] = provenance({}, {}) | {"inputs": inputs}
+        write_artifact(alignment, content)
+        ended = main([*who, "--cameras", str(written), "--output", str(tmp_path / "out" / rig)])
+        return ended, capsys.readouterr().err
+
+    aligned_in = load_json(alignment)["take"]
+    its = tmp_path / "rigs" / f"{aligned_in}.json"
+    assert render(aligned_in, its.name, "0" * 64)[0] == 0
+    status, told = render("tuesday", "tuesday.json", "0" * 64)
+    assert status == 1
+    assert f"tuesday.json: take: is 'tuesday', and {alignment} was made in take '{aligned_in}'" in told
+    assert f"Give the rig of take '{aligned_in}', {its}." in told
+    assert not (tmp_path / "out" / "tuesday.json").exists()
+    status, told = render("canonical", "canonical.json", "0" * 64)
+    assert (status, "leave --alignment away" in told) == (1, True)
+    # What has no name of its own, and what the person was aligned with by whatever name.
+    assert render("default", "default.json", "0" * 64)[0] == 0
+    assert render("photos", "photos.json")[0] == 0
 
 
 def test_an_unknown_identity_is_refused_and_a_text_is_no_prior(prior, tmp_path, capsys):

@@ -11,10 +11,8 @@ from preface.geometry.conventions import (
     camera_to_opencv,
     pixels_from_opencv,
     pixels_to_opencv,
-    pose_from_colmap,
     pose_from_opencv,
     pose_from_opengl,
-    pose_to_colmap,
     pose_to_opencv,
     pose_to_opengl,
 )
@@ -102,15 +100,6 @@ def test_opengl_poses_come_back() -> None:
     np.testing.assert_allclose(np.linalg.det(matrices[:, :3, :3]), 1, atol=1e-12)
     np.testing.assert_allclose(pose_from_opengl(matrices).matrix, pose.matrix, atol=1e-14)
     np.testing.assert_allclose(pose_from_opengl(matrices[:, :3]).matrix, pose.matrix, atol=1e-14)
-
-
-def test_colmap_poses_agree_with_colmap() -> None:
-    pycolmap = pytest.importorskip("pycolmap")
-    pose = random_pose()
-    quaternion, translation = pose_to_colmap(pose)
-    peer = pycolmap.Rigid3d(pycolmap.Rotation3d(quaternion[[1, 2, 3, 0]]), translation)  # takes xyzw
-    np.testing.assert_allclose(peer.matrix(), pose.matrix[:3], atol=1e-14)
-    np.testing.assert_allclose(pose_from_colmap(quaternion, translation).matrix, pose.matrix, atol=1e-14)
 
 
 def test_colmap_cameras_are_taken_as_they_are() -> None:

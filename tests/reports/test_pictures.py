@@ -7,9 +7,12 @@ from preface.reports import (
     colorize,
     contact_sheet,
     finite_range,
+    gradient,
     heat_map,
+    legend,
     overlay_mask_edges,
     overlay_points,
+    with_legend,
 )
 from preface.reports.pictures import GREEN, SHEET_BACKGROUND, TILE_BACKGROUND, as_picture
 
@@ -258,3 +261,37 @@ def test_drawing_leaves_the_given_image_alone():
     overlay_points(image, np.array([[20.0, 20.0]]), ["x"], 4, GREEN)
     overlay_mask_edges(image, np.eye(40), 1, RED)
     assert (image == 9).all()
+
+
+def test_a_legend_shows_its_samples_as_they_are_between_their_words():
+    sample = plain(RED, 20, 30)
+    drawn = legend([("near", sample, "far"), ("", plain(BLUE, 10, 10), "b")], 400)
+    left, top, right, bottom = box_of(drawn, RED)
+    assert (right - left, bottom - top) == (30, 20)
+    assert drawn.shape[1] == 400
+    ink = (np.abs(drawn.astype(int) - np.array(SHEET_BACKGROUND)).sum(-1) > 100).any(0)
+    assert ink[:left].any()
+    assert ink[right : box_of(drawn, BLUE)[0]].any()
+
+
+def test_entries_of_a_legend_go_on_below_where_they_are_too_wide_and_none_is_cut():
+    entry = ("before", plain(RED, 10, 40), "after")
+    one, two = legend([entry], 400), legend([entry, ("before", plain(BLUE, 10, 40), "after")], 260)
+    assert box_of(two, BLUE)[1] > box_of(two, RED)[3]
+    assert two.shape[0] == 2 * one.shape[0]
+    narrow = legend([entry], 5)
+    assert narrow.shape[1] > 40
+    assert (narrow == np.array(RED)).all(-1).sum() == 400
+
+
+def test_a_sheet_with_a_legend_is_the_sheet_above_it():
+    sheet = plain(BLUE, 30, 20)
+    both = with_legend(sheet, [("words", plain(RED, 10, 10), "")])
+    np.testing.assert_array_equal(both[:30, :20], sheet)
+    assert box_of(both, RED)[1] > 30
+    assert share_of(both[:30, 20:], SHEET_BACKGROUND) == 1
+
+
+def test_a_gradient_is_the_colour_map_from_its_low_end_to_its_high_end():
+    bar = gradient("viridis", 50, 3)
+    np.testing.assert_array_equal(bar, colorize(np.linspace(2, 4, 50)[None].repeat(3, 0), 2, 4, "viridis"))

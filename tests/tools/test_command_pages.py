@@ -69,6 +69,16 @@ def test_every_flag_of_the_help_is_on_the_page_and_no_other(name, words, monkeyp
     assert rows or words == () or name == "preface-calibrate"
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [(name, words) for name, words in SUBCOMMANDS if name not in ("preface-fit", "preface-train")],
+)
+def test_the_help_itself_says_every_default(name, words):
+    """tyro writes those of the others."""
+    sections = command_flags.of_parser(SCRIPTS[name], words).sections
+    assert [flag.names for section in sections for flag in section.flags if flag.default] == []
+
+
 @pytest.mark.parametrize("example", [line for tour in TOURS.values() for line in tour.examples])
 def test_the_command_accepts_its_example(example):
     name, *words = shlex.split(example)

@@ -1,6 +1,7 @@
 """A head's surface against a truth that is known in closed form: a ball, seen in two frames of different scale."""
 
 import sys
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +9,23 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
-from bench.head_truth import Surface, mean_errors, reduced, similarity_of_cameras, table, view_errors
+from bench.head_truth import (
+    Surface,
+    mean_errors,
+    read_surface,
+    reduced,
+    show,
+    similarity_of_cameras,
+    table,
+    view_errors,
+)
+from preface.artifacts import ArtifactError
+from preface.capture.images import read_image, write_exr, write_png
 from preface.geometry import Camera, Rigid, Similarity, Views, cast_rays, pixel_centers
 from preface.geometry.transforms import rotation_from_quaternion
 from preface.model.rendering.image import RenderedImage
 from preface.model.rendering.paths import look_at
+from synthetic_studio.layout import Layout
 
 RADIUS = 0.1  # metres, studio
 WIDTH, HEIGHT, FACTOR = 30, 40, 4
@@ -112,6 +125,55 @@ def test_a_reduced_pixel_has_the_median_depth_of_most_of_what_it_covers():
     np.testing.assert_array_equal(found.depth, [[1.0, np.nan]])
     np.testing.assert_allclose(found.normals[0, 0], [0, 0.6, 0.8])
     np.testing.assert_allclose(found.mask, [[1.0, 0.25]])
+
+
+def test_pixels_that_are_no_whole_number_of_the_truth_s_count_those_on_their_border_by_halves():
+    fine = np.broadcast_to([2.0, 4.0, 8.0], (3, 3))  # three pixels under two
+    nothing = np.zeros((3, 3))
+    found = reduced(
+        Surface(fine, np.broadcast_to([0.0, 0.0, 1.0], (3, 3, 3)), nothing + fine), Fraction(3, 2)
+    )
+    np.testing.assert_allclose(found.mask, [[8 / 3, 20 / 3]] * 2)
+    np.testing.assert_array_equal(found.depth, [[2.0, 8.0]] * 2)
+
+
+def studio_of_one_view(folder: Path) -> Layout:
+    """6x9 pixels, 2 m away, facing the camera."""
+    layout = Layout(folder)
+    files = layout.view(0, 0)
+    for path in (files.mask, files.depth, files.normals):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    flat = np.zeros((9, 6), np.float32)
+    write_exr(files.depth, {"Y": flat + 2})
+    write_exr(files.normals, {"R": flat, "G": flat, "B": flat + 1})
+    write_png(files.mask, np.full((9, 6), 65535, np.uint16))
+    return layout
+
+
+def test_the_truth_is_read_at_simple_ratios_of_its_size_and_refused_at_others(tmp_path):
+    layout = studio_of_one_view(tmp_path)
+    for size in ((6, 9), (2, 3), (4, 6)):
+        found = read_surface(layout, "id0000", "cam00", size)
+        assert found.depth.shape == size[::-1]
+        np.testing.assert_array_equal(found.depth, 2)
+        np.testing.assert_array_equal(found.mask, 1)
+    for size in ((12, 18), (3, 3), (5, 9)):
+        with pytest.raises(ArtifactError, match="no simple multiple of"):
+            read_surface(layout, "id0000", "cam00", size)
+
+
+def test_pictures_of_the_right_surface_show_no_error_and_of_a_wrong_one_the_bright_end(surface, tmp_path):
+    show(head(), surface, PLACE, tmp_path / "right", "cam00")
+    away = -30e-3 * studio_pose().translation / np.linalg.norm(studio_pose().translation)
+    show(head(moved=away), surface, PLACE, tmp_path / "wrong", "cam00")
+    middle = (HEIGHT // 2, WIDTH // 2)
+    right, wrong = (
+        read_image(tmp_path / name / "cam00.depth.error.png")[middle] for name in ("right", "wrong")
+    )
+    assert right.max() < 20
+    assert wrong.sum() > 500
+    normals = [read_image(tmp_path / "right" / f"cam00.normals{kind}.png")[middle] for kind in ("", ".true")]
+    np.testing.assert_allclose(*np.asarray(normals, float), atol=3)
 
 
 def test_the_table_has_a_column_per_head_and_a_dash_for_what_is_missing():

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from ablation.design import Cell
-from preface.artifacts import ArtifactError, json_text, json_types, load_json, write_bytes
+from preface.artifacts import ArtifactError, json_types, load_json, write_bytes
 from preface.model.training.folder import require_same_run
+from preface.plain_words import json_text
 
 FACE = "_face"  # the paper's figures are of face crops
 

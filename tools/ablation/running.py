@@ -14,14 +14,14 @@ from ablation.cells import Result, cell_path, cost, read_cell, write_cell
 from ablation.design import Base, Cell, Table
 from ablation.priors import Priors
 from ablation.report import markdown, payload
-from preface.artifacts import json_text, json_types, provenance, sha256, write_bytes
+from preface.artifacts import json_types, provenance, sha256, write_bytes
 from preface.cli.output import say
 from preface.model.evaluation.evaluate import evaluate_head
 from preface.model.evaluation.options import EvaluationOptions
 from preface.model.fitting.configuration import FitConfig, finetuning_steps
 from preface.model.fitting.run import fit_head
 from preface.model.training.prior_files import MODEL_FILE, Prior, read_prior
-from preface.model.training.progress import duration
+from preface.plain_words import duration, json_text
 from preface.shards import Dataset
 
 

@@ -33,6 +33,7 @@ from preface.align.person_file import Alignment, read_alignment
 from preface.capture.rig import Rig
 from preface.cli.align import main as preface_align
 from preface.cli.align_inputs import rigs_of_takes
+from preface.cli.usage import Parser
 
 EYES = [CANONICAL_KEYPOINTS.index(name) for name in ("right_eye_outer", "left_eye_outer")]
 
@@ -82,9 +83,7 @@ class Run:
 
 def main() -> None:
     """Align, compare, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("studio", type=Path)
     parser.add_argument("--rigs", type=Path, help="calibrated rigs of the studio")
     parser.add_argument("--again", type=Path, help="the same studio in another exposure")

@@ -44,6 +44,7 @@ from preface.align.options import AlignmentOptions
 from preface.align.subject import SubjectAlignment, align_subject
 from preface.capture.images import IMAGE_SUFFIXES, displayable, read_image
 from preface.capture.rig import Rig
+from preface.cli.usage import Parser
 
 FULL_STUDIO = 1450, 13  # the paper's people and views
 LEAST_ANGLE = np.radians(20.0)  # between the two views of the DLT
@@ -97,9 +98,7 @@ class Detector:
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("studio", type=Path)
     parser.add_argument("--people", type=int, default=8)
     parser.add_argument("--scales", type=int, nargs="+", default=[256, 512, 1024])

@@ -42,14 +42,13 @@ from preface.capture.calibration.adjustment import Adjusted, least_squares
 from preface.capture.calibration.covariance import Uncertainty, uncertainty
 from preface.capture.calibration.state import free_head
 from preface.capture.calibration.views import BoardViews, stack_views
+from preface.cli.usage import Parser
 from preface.geometry import fit_similarity
 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = {"accuracy": accuracy, "bow": bow, "uncertainty": monte_carlo, "peers": peers}
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--only", nargs="+", choices=parts, default=list(parts))

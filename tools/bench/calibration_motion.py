@@ -29,6 +29,7 @@ from preface.capture.calibration.spanning_tree import assemble
 from preface.capture.calibration.state import free_head
 from preface.capture.calibration.unsynchronised import adjust_moving, unsynchronised
 from preface.capture.calibration.views import stack_views
+from preface.cli.usage import Parser
 from preface.geometry import fit_similarity
 
 SCENE = SceneConfig(
@@ -49,9 +50,7 @@ LAGS = (0.0, 0.005, 0.02, 0.05)  # seconds, standard deviation
 
 def main() -> None:
     """Print a table: lag, how often it was noticed, and the errors of both solutions."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20)
     seeds = parser.parse_args().seeds
     print("lag ms   noticed   centre mm: rigid  moving   focal %: rigid  moving")

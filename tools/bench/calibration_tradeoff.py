@@ -45,6 +45,7 @@ from preface.capture.calibration_files import CalibrationTake, find_calibration
 from preface.capture.detection import DetectionError, DetectionOptions, detect_corners
 from preface.capture.images import read_header, read_image, write_png
 from preface.capture.observations import Observations
+from preface.cli.usage import Parser
 
 BACKENDS = ("own", "pycolmap")
 
@@ -119,9 +120,7 @@ def main() -> None:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("studio", nargs="?", type=Path)
     parser.add_argument("--output", type=Path, default=Path("tradeoff"))
     parser.add_argument("--frames", nargs="+", type=int, default=[5, 10, 20, 40, 80])

@@ -37,6 +37,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from preface.artifacts import load_json, provenance, write_bytes
+from preface.cli.usage import Parser
 from preface.geometry import Rigid
 from preface.model.evaluation.evaluate import evaluate_head
 from preface.model.evaluation.options import EvaluationOptions
@@ -86,9 +87,7 @@ def main() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("shards", type=Path, help="with true cameras")
     parser.add_argument("--prior", type=prior_flag, required=True)
     parser.add_argument("--identities", nargs="+", required=True, help="that the prior has not seen")

@@ -22,6 +22,7 @@ import torch
 
 from preface.artifacts import provenance, write_bytes
 from preface.cli.output import exit_status
+from preface.cli.usage import Parser
 from preface.model.evaluation.evaluate import Evaluation, evaluate_head
 from preface.model.evaluation.options import EvaluationOptions
 from preface.model.matmul import denormals_flushed, keep_freed_memory
@@ -33,9 +34,7 @@ from preface.shards import Dataset
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the bench and return its exit status."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("shards", type=Path)
     parser.add_argument("model", type=prior_flag)
     parser.add_argument("--people", nargs="+", help="identities (default: the first of the model)")

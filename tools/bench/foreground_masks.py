@@ -2,7 +2,7 @@
 
     python tools/bench/foreground_masks.py --studio STUDIO --portrait FOLDER --identities 8 --output masks.json
 
-STUDIO is what `python -m synthetic_studio` writes: its true coverage is the truth. FOLDER holds ``images/`` and
+STUDIO is what `python tools/synthetic_studio` writes: its true coverage is the truth. FOLDER holds ``images/`` and
 ``matte/`` with equal names. Each method that suits a take is measured on it; clean plates are put together from what
 the studio's people leave uncovered. Printed as a Markdown table and written as JSON:
 
@@ -29,6 +29,7 @@ from preface.artifacts import write_bytes
 from preface.capture.foreground import Hints, Segmenter, make_segmenter
 from preface.capture.images import read_image
 from preface.capture.manifest import Capture, read_capture
+from preface.cli.usage import Parser
 
 BAND = 3  # pixels
 
@@ -45,9 +46,7 @@ class View:
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--studio", type=Path, help="a synthetic studio")
     parser.add_argument("--portrait", type=Path, help="a folder with images/ and matte/")
     parser.add_argument("--identities", type=int, default=8, help="of each take")

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
+from preface.cli.usage import Parser
 from preface.geometry import CAMERA_MODELS, Camera, Rigid, Views, cast_rays, lens, stack_intrinsics
 from preface.geometry.transforms import nearest_rotation
 
@@ -20,9 +21,7 @@ FRACTIONS = (0.5, 0.9, 0.99, 0.9999, 0.999999)
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cameras", type=int, default=300, help="random cameras per model and strength")
     parser.add_argument("--points", type=int, default=200, help="random points per camera")
     parser.add_argument("--stride", type=int, default=8, help="grid spacing of the ray comparison, pixels")

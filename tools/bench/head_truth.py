@@ -1,12 +1,13 @@
 """A head's surface against the synthetic studio's: depth in millimetres, normals in degrees, silhouettes.
 
     python tools/bench/head_truth.py HEAD [HEAD ...] --shards shards --studio studio [--identity id0060] [--json FILE]
+        [--pictures FOLDER]
 
 HEAD is what preface-fit or preface-train wrote; the shards hold whole photographs of the studio, lens kept, at its
-resolution or reduced by a whole factor. Each view that the models have not seen is rendered once per kind of normals
-and compared where the studio knows a surface and the head is more than half opaque. Cameras in shards stand in the
-canonical frame, the truth in the studio's: the similarity between the two is that of the cameras' places and
-directions, so that lengths are true millimetres and normals meet in one frame.
+resolution or reduced by a whole factor or a simple ratio such as 8/3. Each view that the models have not seen is
+rendered once per kind of normals and compared where the studio knows a surface and the head is more than half opaque.
+Cameras in shards stand in the canonical frame, the truth in the studio's: the similarity between the two is that of the
+cameras' places and directions, so that lengths are true millimetres and normals meet in one frame.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import argparse
 import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +25,11 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from preface.artifacts import ArtifactError, json_text, provenance, write_bytes
+from bench.head_truth_pictures import write_pictures
+from preface.artifacts import ArtifactError, provenance, write_bytes
 from preface.capture.images import read_exr, read_image
 from preface.capture.rig import read_rig
+from preface.cli.usage import Parser
 from preface.geometry import Rigid, Similarity, nearest_rotation
 from preface.model.evaluation.evaluate import head_renderer
 from preface.model.evaluation.figures import intersection_over_union
@@ -39,12 +43,15 @@ from preface.model.evaluation.views import (
     require_same_space,
     standing_camera,
 )
+from preface.model.matmul import denormals_flushed, keep_freed_memory
 from preface.model.rendering.image import RenderedImage, render_image, space_of
 from preface.model.rendering.shortcuts import Shortcuts
 from preface.model.training.prior_files import Prior, read_prior
+from preface.plain_words import json_text
 from preface.shards import Dataset
 from synthetic_studio.layout import Layout
 
+LARGEST_DENOMINATOR = 8  # of the ratio of sizes: the truth is enlarged by it before it is reduced
 FIGURES = (
     ("depth_median_mm", "depth, median", "mm"),
     ("depth_mean_mm", "depth, mean", "mm"),
@@ -75,20 +82,23 @@ class Surface:
 
 def main() -> None:
     """Measure, print a table, and write JSON if asked."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("heads", type=Path, nargs="+", metavar="HEAD")
     parser.add_argument("--shards", type=Path, required=True)
     parser.add_argument("--studio", type=Path, required=True, help="folder with capture/ and truth/")
     parser.add_argument("--identity")
     parser.add_argument("--views", nargs="+", metavar="CAMERA")
     parser.add_argument("--json", type=Path)
+    parser.add_argument(
+        "--pictures", type=Path, metavar="FOLDER", help="depth, normals and errors of each view, PNG"
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--rays-at-a-time", type=int, default=4096)
     config = parser.parse_args()
+    keep_freed_memory()
     try:
-        result = _measured(config)
+        with denormals_flushed():
+            result = _measured(config)
     except ArtifactError as error:
         sys.exit(str(error))
     print(table(result["heads"]))
@@ -141,6 +151,8 @@ def head_errors(
                 device=torch.device(config.device),
             )
             figures |= view_errors(image, surface, place, kind)
+            if kind == "density" and config.pictures is not None:
+                show(image, surface, place, config.pictures / prior.path.parent.name, name)
         found[name] = figures
         print(f"{prior.path.parent.name}, {identity}/{name}: {figures}", file=sys.stderr, flush=True)
     return found
@@ -177,28 +189,28 @@ def similarity_of_cameras(target: Sequence[Rigid], source: Sequence[Rigid]) -> S
 
 
 def read_surface(layout: Layout, identity: str, camera: str, size: tuple[int, int]) -> Surface:
-    """The studio's surface in a view, reduced to a size (width, height) of which its own is a whole multiple.
+    """The studio's surface in a view, reduced to a size (width, height) that its own is a simple multiple of.
 
     A pixel has a depth, the median, and a normal, the mean, where most of what it covers has.
 
     Raises:
-        ArtifactError: a file is missing, or its size is no whole multiple.
+        ArtifactError: a file is missing, or its size is smaller, of another aspect, or no simple multiple.
     """
     files = layout.view(int(identity.removeprefix("id")), int(camera.removeprefix("cam")))
     depth = read_exr(files.depth)["Y"].astype(np.float64)
     channels = read_exr(files.normals)
     normals = np.stack([channels[name] for name in "RGB"], axis=-1).astype(np.float64)
     mask = read_image(files.mask)[..., 0] / 65535.0
-    factor = depth.shape[1] // size[0]
-    if factor < 1 or depth.shape != (size[1] * factor, size[0] * factor):
-        problem = f"is {depth.shape[1]}x{depth.shape[0]}, no whole multiple of {size[0]}x{size[1]}"
+    factor, other = (Fraction(had, wanted) for had, wanted in zip(depth.shape[::-1], size, strict=True))
+    if factor < 1 or factor != other or factor.denominator > LARGEST_DENOMINATOR:
+        problem = f"is {depth.shape[1]}x{depth.shape[0]}, no simple multiple of {size[0]}x{size[1]}"
         remedy = "Build shards of whole photographs at the studio's resolution divided by a whole number"
         raise ArtifactError(files.depth, "size", problem, remedy)
     return reduced(Surface(depth, normals, mask), factor)
 
 
-def reduced(surface: Surface, factor: int) -> Surface:
-    """The same with blocks of pixels in place of pixels."""
+def reduced(surface: Surface, factor: Fraction) -> Surface:
+    """The same with what lies in a larger pixel in place of pixels; those on its border count by their parts in it."""
     depth, mask = (_blocks(values, factor) for values in (surface.depth, surface.mask))
     normals = np.stack([_blocks(surface.normals[..., axis], factor) for axis in range(3)], axis=-1)
     most = np.isfinite(depth).mean(axis=2) > 0.5
@@ -209,11 +221,12 @@ def reduced(surface: Surface, factor: int) -> Surface:
     return Surface(medians, means, mask.mean(axis=2))
 
 
-def _blocks(values: np.ndarray, factor: int) -> np.ndarray:
-    """Values [H, W] as [H / factor, W / factor, factor²]."""
-    height, width = values.shape[0] // factor, values.shape[1] // factor
-    blocks = values.reshape(height, factor, width, factor).swapaxes(1, 2)
-    return blocks.reshape(height, width, factor * factor)
+def _blocks(values: np.ndarray, factor: Fraction) -> np.ndarray:
+    """Values [H, W] as [H / factor, W / factor, numerator²], each value as often as its part of a pixel has parts."""
+    parts = values.repeat(factor.denominator, 0).repeat(factor.denominator, 1)
+    side = factor.numerator
+    height, width = parts.shape[0] // side, parts.shape[1] // side
+    return parts.reshape(height, side, width, side).swapaxes(1, 2).reshape(height, width, side * side)
 
 
 def view_errors(image: RenderedImage, surface: Surface, place: Similarity, kind: str) -> dict[str, float]:
@@ -231,27 +244,52 @@ def view_errors(image: RenderedImage, surface: Surface, place: Similarity, kind:
         the studio's surface that was compared. Figures of which no pixel has both are left out.
     """
     found = {"silhouette_iou": intersection_over_union(image.alpha > FOREGROUND, surface.mask > FOREGROUND)}
-    both = np.isfinite(image.depth) & np.isfinite(surface.depth)
+    error = depth_error(image, surface, place)
+    both = np.isfinite(error)
     found["compared"] = float(both.sum() / max(np.isfinite(surface.depth).sum(), 1))
     if both.any():
-        error = 1e3 * (image.depth[both] / place.scale - surface.depth[both])
         found |= {
-            "depth_median_mm": float(np.median(np.abs(error))),
-            "depth_mean_mm": float(np.abs(error).mean()),
-            "depth_bias_mm": float(np.median(error)),
+            "depth_median_mm": float(np.median(np.abs(error[both]))),
+            "depth_mean_mm": float(np.abs(error[both]).mean()),
+            "depth_bias_mm": float(np.median(error[both])),
         }
     if image.normals is not None:
-        known = both & np.isfinite(image.normals).all(axis=-1) & np.isfinite(surface.normals).all(axis=-1)
-        if known.any():
-            ours, true = image.normals[known].astype(np.float64) @ place.rotation, surface.normals[known]
-            angles = np.degrees(
-                np.arctan2(np.linalg.norm(np.cross(ours, true), axis=-1), (ours * true).sum(-1))
-            )
+        angles = normals_error(image.normals, surface, place)[both]
+        angles = angles[np.isfinite(angles)]
+        if angles.size:
             found |= {
                 f"{kind}_normals_median_deg": float(np.median(angles)),
                 f"{kind}_normals_mean_deg": float(angles.mean()),
             }
     return found
+
+
+def depth_error(image: RenderedImage, surface: Surface, place: Similarity) -> np.ndarray:
+    """How much too far the head is, [H, W], mm of the studio; NaN where one of both has no depth."""
+    return 1e3 * (image.depth / place.scale - surface.depth)
+
+
+def normals_error(normals: np.ndarray, surface: Surface, place: Similarity) -> np.ndarray:
+    """The angle to the studio's normals, [H, W], degrees, of normals [H, W, 3] of the canonical frame; NaN likewise."""
+    ours, true = normals.astype(np.float64) @ place.rotation, surface.normals
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(ours, true), axis=-1), (ours * true).sum(-1)))
+
+
+def show(image: RenderedImage, surface: Surface, place: Similarity, folder: Path, camera: str) -> None:
+    """Write the pictures of a view, in the studio's frame and metres; see `write_pictures`.
+
+    Raises:
+        ValueError: the image was rendered without normals.
+        ArtifactError: the disk refuses.
+    """
+    if image.normals is None:
+        raise ValueError("these pictures need normals")
+    folder.mkdir(parents=True, exist_ok=True)
+    depths = (surface.depth, image.depth / float(place.scale), depth_error(image, surface, place))
+    ours = image.normals.astype(np.float64) @ place.rotation
+    write_pictures(
+        folder, camera, depths, (surface.normals, ours, normals_error(image.normals, surface, place))
+    )
 
 
 def mean_errors(views: Sequence[Mapping[str, float]]) -> dict[str, float]:

@@ -36,6 +36,7 @@ from preface.capture.images import read_header, read_image, write_exr, write_jpe
 from preface.capture.preparation import PreparationOptions, Resampler, framing_window, split_alpha
 from preface.capture.preparation.transfer import bytes_of_light, reader
 from preface.capture.preparation.undistortion import Route
+from preface.cli.usage import Parser
 from preface.geometry import Camera, lens
 from preface.srgb import decode, encode
 
@@ -91,9 +92,7 @@ def choices(reducible: bool) -> list[Choice]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pictures", nargs="*", type=Path, help="to measure instead of one that is made")
     parser.add_argument("--size", default="512x768", help="of the results")
     parser.add_argument("--repeats", type=int, default=5, help="of each measurement")

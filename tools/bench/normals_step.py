@@ -29,6 +29,7 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from bench.training_step import CHUNK, SMALLEST_RADIUS, seconds, some_rays
+from preface.cli.usage import Parser
 from preface.model import coord, losses
 from preface.model.configuration import PRESETS, ModelConfig, preset
 from preface.model.matmul import choose_route, denormals_flushed, keep_freed_memory
@@ -112,9 +113,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 def main() -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--presets", nargs="+", default=["paper", "small", "tiny"], choices=list(PRESETS))
     parser.add_argument("--repeats", type=int, default=5, help="of which the fastest counts")
     parser.add_argument("--output", type=Path, default=Path("normals_step.json"))

@@ -37,6 +37,7 @@ from preface.artifacts import load_json
 from preface.capture.formats.registry import read_rig_from
 from preface.capture.photos.files import find_photographs
 from preface.capture.rig import Rig, RigCamera, read_rig
+from preface.cli.usage import Parser
 from preface.geometry import Similarity, fit_similarity
 
 MAX_ANGLE = np.radians(40)
@@ -56,9 +57,7 @@ class Reference:
 
 def main() -> None:
     """Detect, draw subsets, align, compare, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--counts", type=int, nargs="+", default=[1, 2, 3, 7], help="photographs at a time")
     parser.add_argument("--subsets", type=int, default=6, help="choices of photographs per count")

@@ -26,6 +26,7 @@ import numpy as np
 import torch
 
 from preface.cli.output import say
+from preface.cli.usage import Parser
 from preface.model.matmul import denormals_flushed, keep_freed_memory
 from preface.model.pretrained import prior_flag
 from preface.model.rendering.image import RenderedImage, RenderRays, Space, render_image, space_of
@@ -110,9 +111,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", type=prior_flag)
     parser.add_argument("--identity")
     parser.add_argument("--sides", type=int, nargs="+", default=[512, 1024, 2048, 4096])

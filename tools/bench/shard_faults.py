@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from preface.artifacts import ArtifactError
+from preface.cli.usage import Parser
 from preface.shards import verify
 from preface.shards.format import PAGE
 
@@ -35,9 +36,7 @@ CALLS = ("pwrite", "fsync", "replace", "open")
 
 def main() -> int:
     """Run everything and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--flips", type=int, default=1000, help="flipped bits per pixel order")
     parser.add_argument("--kills", type=int, default=1000, help="builders that are killed")
     parser.add_argument("--points", type=int, default=50, help="points at which the disk is full")

@@ -38,6 +38,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from bench.shard_peers import PEERS, RAYS, VIEWS, Batches, Peer, drop_from_cache
 from preface.artifacts import provenance, write_bytes
+from preface.cli.usage import Parser
 from preface.geometry import Camera, Rigid, Views
 from preface.shards import Dataset, Loader, PaperPattern, Pick, Pixels, Placement, SingleRays
 from preface.shards.building import build_manifest
@@ -103,9 +104,7 @@ def row(*cells: str) -> None:
 
 def main() -> None:
     """Measure, print, and write the JSON."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--peers", action="store_true", help="measure peers too, where they are installed")
     parser.add_argument("--folder", type=Path, help="where to put the data; a temporary folder by default")
     parser.add_argument("--threads", type=int, default=1, help="of torch")

@@ -22,6 +22,7 @@ from preface.artifacts import load_json
 from preface.capture.images import read_image
 from preface.capture.manifest import read_capture
 from preface.capture.rig import read_rig
+from preface.cli.usage import Parser
 from synthetic_studio.facemesh import detect
 
 GROUPS = {
@@ -45,9 +46,7 @@ WANTED_VIEWS = 10
 
 def main() -> None:
     """Detect in every view, compare with the truth, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("studio", type=Path)
     parser.add_argument("--json", type=Path, help="also write the figures here")
     arguments = parser.parse_args()

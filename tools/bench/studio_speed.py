@@ -15,6 +15,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from preface.cli.usage import Parser
+
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from synthetic_studio.config import parse_resolution
@@ -26,9 +28,7 @@ from synthetic_studio.template import head_template
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--identities", type=int, default=4)
     parser.add_argument("--resolution", default="256x384")
     parser.add_argument("--antialias", type=int, default=2)

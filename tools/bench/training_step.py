@@ -32,6 +32,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from preface.cli.usage import Parser
 from preface.model import coord, losses, stepfun, volume
 from preface.model.configuration import PRESETS, ModelConfig, preset
 from preface.model.matmul import Route, choose_route, denormals_flushed, keep_freed_memory, measure_route
@@ -261,7 +262,7 @@ def work_of(options: argparse.Namespace, preset: str) -> Work:
 
 def arguments() -> argparse.ArgumentParser:
     """What can be asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = Parser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--presets", nargs="+", default=["paper", "small", "tiny"], choices=list(PRESETS))
     parser.add_argument("--device", choices=list(RATE), default="cpu", help="where (default: cpu)")
     parser.add_argument("--repeats", type=int, default=5, help="of which the fastest counts")

@@ -26,6 +26,7 @@ from preface.align.keypoints import CANONICAL_KEYPOINTS, FACEMESH478, Scheme
 from preface.align.keypoints3d import form_keypoints
 from preface.align.options import AlignmentOptions, TriangulationOptions
 from preface.align.triangulation import Reason, Triangulation, triangulate
+from preface.cli.usage import Parser
 from preface.geometry import Views
 from synthetic_studio.rig import StudioCamera, nominal_rig
 
@@ -192,9 +193,7 @@ def _one(found: Triangulation, index: int) -> Triangulation:
 
 def main() -> int:
     """Measure, print, and return 1 when a target is missed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=10000)
     parser.add_argument("--views", type=int, default=13)
     parser.add_argument("--runs", type=int, default=5, help="runs of which the fastest counts")

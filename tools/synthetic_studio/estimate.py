@@ -43,9 +43,28 @@ class Cost:
         return self.photographs + self.calibration_images + self.plates
 
 
+def photograph_seconds(config: StudioConfig) -> float:
+    """One photograph of a person who is modelled already, its truth included."""
+    return _pixels(config) * (PIXEL + config.antialias**2 * SAMPLE)
+
+
+def board_seconds(config: StudioConfig) -> float:
+    """One calibration image."""
+    return _pixels(config) * BOARD_PIXEL
+
+
+def plate_seconds(config: StudioConfig) -> float:
+    """One clean plate."""
+    return _pixels(config) * PIXEL
+
+
+def _pixels(config: StudioConfig) -> int:
+    width, height = config.size
+    return width * height
+
+
 def estimate(config: StudioConfig) -> Cost:
     """The cost of a whole run of a valid configuration."""
-    pixels = config.size[0] * config.size[1]
     stations = config.takes * config.views
     photographs = config.identities * config.views
     frames = stations * config.board.frames
@@ -53,13 +72,12 @@ def estimate(config: StudioConfig) -> Cost:
     green = sum(backdrop(config, take) == "green" for take in range(config.takes)) / config.takes
     size = frames * BOARD_BYTES + photographs * (_mixed(PHOTOGRAPH_BYTES, green) + TRUTH_BYTES)
     size += plates * _mixed(PLATE_BYTES, green)
-    time = frames * BOARD_PIXEL + plates * PIXEL + photographs * (PIXEL + config.antialias**2 * SAMPLE)
+    seconds = frames * board_seconds(config) + plates * plate_seconds(config)
+    seconds += photographs * photograph_seconds(config)
     # Workers that share a person's views each model the person.
     built = min(max(config.identities, config.workers), photographs)
-    fixed = config.workers * START + built * HEAD
-    return Cost(
-        photographs, frames, plates, size * pixels + config.identities * HEAD_BYTES, time * pixels + fixed
-    )
+    seconds += config.workers * START + built * HEAD
+    return Cost(photographs, frames, plates, size * _pixels(config) + config.identities * HEAD_BYTES, seconds)
 
 
 def _mixed(cost: dict[str, float], green: float) -> float:

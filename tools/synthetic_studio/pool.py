@@ -12,14 +12,17 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing.sharedctypes import Synchronized
+from multiprocessing.sharedctypes import SynchronizedArray
 from multiprocessing.synchronize import Event
 
 import cv2
-from tqdm import tqdm
 
 from preface.artifacts import ArtifactError
+from preface.cli.output import say
+from preface.plain_words import counted, duration
+from preface.progress import Progress
 from synthetic_studio.config import StudioConfig, StudioError
+from synthetic_studio.estimate import START
 from synthetic_studio.tasks import Studio, Task
 
 # One thread per worker: the workers fill the cores, and sums come out the same whatever their number.
@@ -35,45 +38,52 @@ class _Worker:
 
     studio: Studio
     stop: Event
-    finished_images: Synchronized[int]
+    finished: SynchronizedArray[float]  # images of all workers, and seconds that the cost model gives them
 
 
 _worker: _Worker | None = None
 
 
 def run_tasks(config: StudioConfig, subject_module: str, tasks: Sequence[Task]) -> None:
-    """Run the tasks on `config.workers` processes, with a progress bar when there is a terminal.
+    """Run the tasks on `config.workers` processes, and tell how far they are.
 
     Raises:
         StudioError: a task failed, or a worker was killed; the other workers have then stopped.
         KeyboardInterrupt: after the workers have finished the images at hand.
     """
-    total = sum(task.images for task in tasks)
     if not tasks:
         return
     context = multiprocessing.get_context("spawn")
-    stop, finished = context.Event(), context.Value("q", 0)
+    stop, finished = context.Event(), context.Array("d", 2)
     workers = min(config.workers, len(tasks))
+    images, seconds = sum(task.images for task in tasks), sum(task.seconds(config) for task in tasks)
+    say(
+        f"{counted(images, 'image', 'images')} to make with {counted(workers, 'worker', 'workers')}, "
+        f"about {duration(START + seconds / workers)} by the studio's cost model"
+    )
     with (
         _environment(SINGLE_THREADED),
-        tqdm(total=total, unit="image", disable=None, smoothing=0.05) as bar,
+        Progress(images, "images", seconds) as progress,
         ProcessPoolExecutor(workers, context, _start, (config, subject_module, stop, finished)) as pool,
     ):
         try:
             with _interrupts_deferred():  # the children inherit it: Ctrl-C is for the parent to handle
                 futures = [pool.submit(_run, task) for task in tasks]
-            _watch(futures, bar, finished)
+            _watch(futures, progress, finished)
         except BaseException:
             stop.set()
             pool.shutdown(wait=True, cancel_futures=True)
             raise
 
 
-def _watch(futures: list[Future[None]], bar: tqdm, finished: Synchronized[int]) -> None:
+def _watch(futures: list[Future[None]], progress: Progress, finished: SynchronizedArray[float]) -> None:
     waiting = set(futures)
+    images, seconds = 0, 0.0
     while waiting:
         done, waiting = wait(waiting, timeout=POLL_SECONDS)
-        bar.update(finished.value - bar.n)
+        now_images, now_seconds = finished[:]
+        progress.add(int(now_images) - images, now_seconds - seconds)
+        images, seconds = int(now_images), now_seconds
         for future in done:
             try:
                 future.result()
@@ -84,7 +94,9 @@ def _watch(futures: list[Future[None]], bar: tqdm, finished: Synchronized[int]) 
                 ) from error
 
 
-def _start(config: StudioConfig, subject_module: str, stop: Event, finished: Synchronized[int]) -> None:
+def _start(
+    config: StudioConfig, subject_module: str, stop: Event, finished: SynchronizedArray[float]
+) -> None:
     global _worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
@@ -111,8 +123,9 @@ def _run(task: Task) -> None:
             raise StudioError(f"{step.what}: {error}") from error
         except Exception as error:
             raise StudioError(f"{step.what}: {error}\n{traceback.format_exc()}") from error
-        with _worker.finished_images.get_lock():
-            _worker.finished_images.value += step.images
+        with _worker.finished.get_lock():
+            _worker.finished[0] += step.images
+            _worker.finished[1] += step.seconds
 
 
 @contextlib.contextmanager

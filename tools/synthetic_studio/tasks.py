@@ -24,6 +24,7 @@ from synthetic_studio.backgrounds import backdrop, background_radiance, composit
 from synthetic_studio.board_render import KEY_DIRECTION, BoardCamera, render_board
 from synthetic_studio.boards import board_pose
 from synthetic_studio.config import StudioConfig
+from synthetic_studio.estimate import HEAD, board_seconds, photograph_seconds, plate_seconds
 from synthetic_studio.layout import Layout, frame_id, identity_id, take_id
 from synthetic_studio.patterns import BoardPattern
 from synthetic_studio.rig import StudioCamera, camera_id, nominal_rig, take_rig
@@ -74,10 +75,11 @@ class Subject(Protocol):
 
 @dataclass(frozen=True)
 class Step:
-    """A part of a task that is not interrupted: what it makes, how many images that is, and how."""
+    """A part of a task that is not interrupted: what it makes, how many images that is, in which time, and how."""
 
     what: str
     images: int
+    seconds: float
     work: Callable[[], None]
 
 
@@ -95,15 +97,20 @@ class CalibrationTask:
         """Number of images that the task writes into the capture."""
         return len(self.frames) + self.plate
 
+    def seconds(self, config: StudioConfig) -> float:
+        """By the cost model, on one core."""
+        return len(self.frames) * board_seconds(config) + self.plate * plate_seconds(config)
+
     def steps(self, studio: Studio) -> Iterator[Step]:
         """The work, image by image."""
         where = f"take {take_id(self.take)}, camera {camera_id(self.camera)}"
         if self.plate:
-            yield Step(f"clean plate of {where}", 1, partial(studio.write_plate, self.take, self.camera))
+            work = partial(studio.write_plate, self.take, self.camera)
+            yield Step(f"clean plate of {where}", 1, plate_seconds(studio.config), work)
         view = BoardCamera(studio.rig(self.take)[self.camera].camera)
         for frame in self.frames:
             work = partial(studio.write_frame, self.take, self.camera, frame, view)
-            yield Step(f"calibration {frame_id(frame)} of {where}", 1, work)
+            yield Step(f"calibration {frame_id(frame)} of {where}", 1, board_seconds(studio.config), work)
 
 
 @dataclass(frozen=True)
@@ -119,15 +126,21 @@ class HeadTask:
         """Number of images that the task writes into the capture."""
         return len(self.views)
 
+    def seconds(self, config: StudioConfig) -> float:
+        """By the cost model, on one core."""
+        return HEAD + len(self.views) * photograph_seconds(config)
+
     def steps(self, studio: Studio) -> Iterator[Step]:
         """The work, image by image."""
-        who = f"identity {identity_id(self.identity)}"
+        who, seconds = f"identity {identity_id(self.identity)}", photograph_seconds(studio.config)
+        modelling = HEAD  # part of whatever comes first
         if self.describe:
-            yield Step(f"{who}, the head", 0, partial(studio.write_head, self.identity))
+            yield Step(f"{who}, the head", 0, modelling, partial(studio.write_head, self.identity))
+            modelling = 0.0
         for camera in self.views:
-            yield Step(
-                f"{who}, view {camera_id(camera)}", 1, partial(studio.write_view, self.identity, camera)
-            )
+            work = partial(studio.write_view, self.identity, camera)
+            yield Step(f"{who}, view {camera_id(camera)}", 1, seconds + modelling, work)
+            modelling = 0.0
 
 
 Task = CalibrationTask | HeadTask

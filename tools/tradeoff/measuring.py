@@ -33,11 +33,11 @@ from preface.model.rendering.paths import framing_camera, on_sphere
 from preface.model.rendering.shortcuts import accelerate
 from preface.model.training.prior_files import Prior, read_prior
 from preface.shards import Dataset
+from tradeoff.front import MOST
 from tradeoff.points import NORMALS, Point
 
 RAYS_AT_A_TIME = 4096
 KEPT = ("rgb", "alpha", "depth")  # of full renders
-MOST = 100.0  # dB, of images that are equal
 
 
 @dataclass(frozen=True)

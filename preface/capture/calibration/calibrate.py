@@ -126,20 +126,6 @@ class Calibration:
         """Over the inliers, pixels, as if the board stood still in each frame."""
         return float(np.sqrt((self.residuals_at_rest[self.inliers] ** 2).sum(axis=-1).mean()))
 
-    def point_covariance(self, points: np.ndarray, pixel_noise: float) -> np.ndarray:
-        """Predict the covariance [N, 3, 3] of triangulated points [N, 3] (rig frame), calibration and noise.
-
-        The calibration's part holds under the datum "boards". Cameras whose image shows a point see it.
-        """
-        visible = np.zeros((len(points), len(self.cameras)), bool)
-        for index, camera in enumerate(self.cameras):
-            pose = Rigid(self.camera_from_rig.rotation[index], self.camera_from_rig.translation[index])
-            pixels, valid = camera.project(pose.apply(points))
-            size = (camera.width, camera.height)
-            visible[:, index] = valid & ((pixels >= 0) & (pixels <= size)).all(axis=-1)
-        of_calibration, of_noise = self.uncertainty.under("boards").points(points, visible, pixel_noise)
-        return of_calibration + of_noise
-
     def rig(self, take: str) -> Rig:
         """Return the artefact `rig.json` holds."""
         params, rotation, translation = self.uncertainty.standard_deviations

@@ -194,11 +194,12 @@ def _head(section: Section, head: HeadResult) -> None:
             "jpeg",
         )
     normals = any(view.normals is not None for view in head.pictures)
-    frame = ", normals in the canonical frame (red to the subject's left, green up, blue out of the face)"
+    frame = ", normals in the canonical frame"
     section.image(
         sheet(head.pictures),
-        f"Whole frames: photograph, render, error, depth ({DEPTH_SHOWN} m before and behind the middle of the face, "
-        f"from dark to bright; a checker board where the head is transparent){frame if normals else ''}, opacity.",
+        f"Whole frames: photograph, render, error, depth in front of the camera ({DEPTH_SHOWN} m before and behind the "
+        f"middle of the face; a checker board where the head is transparent){frame if normals else ''}, opacity. The "
+        "legend at the bottom says what the colours mean.",
         f"All views of {measured.identity} with error, depth{', normals' if normals else ''} and opacity.",
         "jpeg",
     )

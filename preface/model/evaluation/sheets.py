@@ -1,8 +1,8 @@
 """Pictures of evaluated views: truth, render, error, depth, normals and opacity, small enough to keep many.
 
-Normals are shown in the canonical frame: red grows to the subject's left, green up, blue out of the face. Errors are
-the mean over channels of the absolute difference, on one scale for every head. Depth runs from dark (near) to bright,
-about the depth of the canonical origin in that view, so that the face has colours of its own.
+Normals are shown in the canonical frame. Errors are the mean over channels of the absolute difference, on one scale for
+every head. Depth runs from dark (near) to bright, about the depth of the canonical origin in that view, so that the
+face has colours of its own. A legend below the sheet says what the colours mean.
 """
 
 from __future__ import annotations
@@ -15,8 +15,18 @@ import numpy as np
 
 from preface.model.evaluation.evaluate import EvaluatedView
 from preface.model.evaluation.metrics_file import FIGURES
-from preface.model.rendering.showing import ERROR_SHOWN, SMALLEST, error_picture, normals_picture, tile_size
-from preface.reports.pictures import Picture, as_picture, colorize, contact_sheet
+from preface.model.rendering.showing import (
+    ERROR_SHOWN,
+    SMALLEST,
+    depth_entry,
+    depth_picture,
+    error_entry,
+    error_picture,
+    normals_entry,
+    normals_picture,
+    tile_size,
+)
+from preface.reports.pictures import Picture, as_picture, contact_sheet, with_legend
 
 TALLEST = 480  # pixels of a tile's height; larger images are reduced
 FACE_TALLEST, FACE_SMALLEST = 360, 240
@@ -32,6 +42,7 @@ class ViewPictures:
         name: of the camera.
         figures: by name.
         truth, rgb, error, depth, normals, alpha: of the frame; without normals where none were asked for.
+        depths: metres in front of the camera that the darkest and the brightest colour of depth stand for.
         face_truth, face_rgb, face_error: None where no face is in the image.
     """
 
@@ -41,6 +52,7 @@ class ViewPictures:
     rgb: Picture
     error: Picture
     depth: Picture
+    depths: tuple[float, float]
     normals: Picture | None
     alpha: Picture
     face_truth: Picture | None
@@ -55,14 +67,15 @@ def view_pictures(view: EvaluatedView) -> ViewPictures:
     faces = [None if square is None else _reduced(square.of(frame), FACE_TALLEST) for frame in frames]
     truth, rgb, error = (_reduced(frame, TALLEST) for frame in frames)
     middle = float(view.figures.canonical_from_camera.inverse.translation[2])  # depth of the origin
-    depth = colorize(view.depth, middle - DEPTH_SHOWN, middle + DEPTH_SHOWN, "viridis")
+    depths = (middle - DEPTH_SHOWN, middle + DEPTH_SHOWN)
     return ViewPictures(
         name=view.figures.name,
         figures={name: view.figures.values[name] for name in FIGURES if name in view.figures.values},
         truth=truth,
         rgb=rgb,
         error=error,
-        depth=_reduced(depth, TALLEST),
+        depth=_reduced(depth_picture(view.depth, *depths), TALLEST),
+        depths=depths,
         normals=None if view.normals is None else _reduced(normals_picture(view.normals), TALLEST),
         alpha=_reduced(as_picture(view.alpha), TALLEST),
         face_truth=faces[0],
@@ -72,18 +85,22 @@ def view_pictures(view: EvaluatedView) -> ViewPictures:
 
 
 def sheet(views: Sequence[ViewPictures]) -> Picture:
-    """A row per view: truth, render, error, depth, normals where there are any, opacity."""
+    """A row per view: truth, render, error, depth, normals where there are any, opacity; below, a legend."""
     tiles: list[tuple[Picture | None, str]] = []
     for view in views:
         tiles += [
             (view.truth, view.name),
             (view.rgb, f"{view.figures['psnr']:.2f} dB"),
             (view.error, f"error, 0 to {ERROR_SHOWN}"),
-            (view.depth, f"depth, ±{DEPTH_SHOWN} m"),
+            (view.depth, f"depth, {view.depths[0]:.2f} to {view.depths[1]:.2f} m"),
             *([] if view.normals is None else [(view.normals, "normals")]),
             (view.alpha, "opacity"),
         ]
-    return contact_sheet(tiles, len(tiles) // len(views), _tile(views[0].truth))
+    there = f"{1000 * DEPTH_SHOWN:.0f} mm"
+    entries = [depth_entry(f"{there} nearer than the middle of the face", f"{there} further"), error_entry()]
+    entries += [normals_entry()] if any(view.normals is not None for view in views) else []
+    drawn = contact_sheet(tiles, len(tiles) // len(views), _tile(views[0].truth))
+    return with_legend(drawn, entries)
 
 
 def face_sheet(views: Sequence[ViewPictures]) -> Picture | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from preface.artifacts import ArtifactError, provenance
+from preface.model import pretrained
 from preface.model.fitting.configuration import FitConfig
 from preface.model.fitting.description import inputs_of
 from preface.model.fitting.observations import template_gap
@@ -49,10 +50,12 @@ def note_template(dataset: Dataset, prior: Prior, say: Say) -> None:
     """Tell of faces that are elsewhere than the prior expects them."""
     gap = template_gap(dataset, prior)
     if gap is not None and gap > _SAME_TEMPLATE:
+        folder = prior.path.parent
+        template = pretrained.PRETRAINED if folder == pretrained.FOLDER else pretrained.flag_word(folder)
         say(
             f"note: the people of {dataset.manifest.path.parent} were placed on another template than the prior's, "
-            f"{1e3 * gap:.1f} mm away (RMS); align them with preface-align --template and the prior's folder, or the "
-            "word pretrained"
+            f"{1e3 * gap:.1f} mm away (RMS); align them with preface-align studio CAPTURE --rig RIG --template "
+            f"{template}"
         )
 
 

@@ -20,9 +20,17 @@ from preface.model.metrics.image_quality import psnr
 from preface.model.model import PriorModel
 from preface.model.rendering.image import RenderedImage, Space, render_image
 from preface.model.rendering.shortcuts import DEFAULT_QUALITY, QUALITIES, accelerate
-from preface.model.rendering.showing import ERROR_SHOWN, error_picture, normals_picture, tile_size
+from preface.model.rendering.showing import (
+    ERROR_SHOWN,
+    depth_picture,
+    error_entry,
+    error_picture,
+    normals_entry,
+    normals_picture,
+    tile_size,
+)
 from preface.model.training.data import TrainingData
-from preface.reports.pictures import Picture, as_picture, colorize, contact_sheet
+from preface.reports.pictures import Picture, as_picture, contact_sheet, with_legend
 from preface.shards.heads import standing
 
 PIXELS = 2**13  # of a picture, at most; previews are to be looked at, not measured
@@ -49,7 +57,7 @@ class Previewer:
     micro_rays: int
 
     def sheet(self) -> tuple[Picture, list[float]]:
-        """A row per view: photograph, render, error, depth, normals and a new view.
+        """A row per view: photograph, render, error, depth, normals and a new view; below, a legend.
 
         Returns:
             The sheet, and the PSNR of each view on black, whole pictures, dB.
@@ -59,7 +67,8 @@ class Previewer:
             row, quality = self._row(person, view, render)
             tiles += row
             found.append(quality)
-        return contact_sheet(tiles, _COLUMNS, tile_size(*self._size())), found
+        drawn = contact_sheet(tiles, _COLUMNS, tile_size(*self._size()))
+        return with_legend(drawn, [error_entry(), normals_entry()]), found
 
     def _renderer(self) -> Callable[[Camera, Rigid], RenderedImage]:
         """Render the head as it is now, by shortcuts: a preview shall not take longer than the fit."""
@@ -84,7 +93,7 @@ class Previewer:
             (as_picture(truth), str(entry.cameras[view])),
             (as_picture(seen.rgb), f"{quality:.2f} dB"),
             (error_picture(seen.rgb, truth), f"error, 0 to {ERROR_SHOWN}"),
-            (colorize(seen.depth, *depths, "viridis"), "depth"),
+            (depth_picture(seen.depth, *depths), f"depth, {depths[0]:.2f} to {depths[1]:.2f} m"),
             (normals_picture(seen.normals), "normals"),
             (as_picture(new.rgb), "a new view"),
         ]

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 class Shortcuts:
     """Shortcuts of rendering; with the defaults everything is evaluated as it was trained.
 
-    Figures are means over three heads of a `small` prior at views of 96x144 that it had not seen, CPU time on one
-    thread as a share of the model's without shortcuts; `tools/measure_tradeoff.py` measures them for other models.
+    The README's table "Speed for accuracy" has what each saves and costs, alone and after the others;
+    `tools/measure_tradeoff.py` measures it for other models.
 
     Raises:
         ValueError: a value that cannot be, named by its field.
@@ -35,43 +35,37 @@ class Shortcuts:
     rounding."""
     occupancy: int = 0
     """Cubes along the box's longest side, at whose corners the density is evaluated before rays are cast; rays that
-    meet no occupied cube are not evaluated, others between the first and the last that they meet; 0: no grid. 64,
-    alone: 0.63 of the time, 53 dB to the render without; it takes as long to prepare as 3,000 rays, of which an
-    image of 96x144 has 14,000."""
+    meet no occupied cube are not evaluated, others between the first and the last that they meet; 0: no grid. Finer
+    cubes leave less to evaluate and take longer to prepare, which pays for an image and not for a few rays."""
     empty_alpha: float = 0.001
-    """Opacity that a cube of the grid may have and still count as empty; a fog thinner than that is lost. From 0.001 to
-    0.01: the same figures, 1 % fewer rays on a trained head."""
+    """Opacity that a cube of the grid may have and still count as empty; a fog thinner than that is lost. More leaves
+    out more rays."""
     skipped_rounds: int = 0
     """Proposal rounds, from the first, in whose place the grid says where light may stop; more than there are: all.
-    All, with 64 cubes and bf16: 0.24 of the time; 49.5 dB to the fullest render, from which the model as trained is
-    48.4 dB."""
+    Each that is skipped saves its network; the samples of the last round are then as right as the grid is fine."""
     sample_share: float = 1.0
-    """Share of the last round's samples that are placed, of those that the model was trained with. 0.75 after the
-    above: 0.19 of the time, 46.6 dB to the fullest render, 0.02 dB to photographs."""
+    """Share of the last round's samples that are placed, of those that the model was trained with. Time goes with
+    it; fewer find an edge less exactly."""
     short_share: float = 1.0
-    """The same for rays whose light stops within a short piece, if it is less. 0.5, of 3 cm, after the same: 0.20 of
-    the time, 47.6 dB to the fullest render."""
+    """The same for rays whose light stops within a short piece, if it is less."""
     short: float = 0.02
     """How long, in metres, a short piece is."""
     weight_bound: float = 0.0
-    """Samples that can get at most this share of the ray's light are not evaluated. 0.002: 11 % of the samples,
-    less than 0.01 dB."""
+    """Samples that can get at most this share of the ray's light are not evaluated; what they add up to
+    is missing."""
     color_bound: float = 0.0
-    """Samples that got at most this share of the ray's light have no colour and no normal. 0.002: from 49.5 to 49.2
-    dB to the fullest render."""
+    """Samples that got at most this share of the ray's light have no colour and no normal; what they add up to is
+    missing."""
     opaque_normals: bool = False
     """Find normals only of rays that show one, those of which half the light stops; no other ray's are shown."""
     predicted_normals: bool = False
     """Show the normals that a head predicts, where it does, in place of the density's: smooth, and without
-    derivatives. Of three heads of a `small` prior after 200 steps of finetuning they were off by 38 to 41 degrees
-    (median over views not fitted to), the density's by 21 to 26 (`tools/bench/head_truth.py`)."""
+    derivatives, but further off; `tools/bench/head_truth.py` measures both against heads that are known."""
     matmul: Literal["", "fp32", "bf16"] = ""
-    """Precision of products inside the networks; by default as trained. bf16: 0.71 of the time on a processor that
-    has such products, 68 dB to the render without; one that is not faster with them, which is tried once, takes
-    fp32."""
+    """Precision of products inside the networks; by default as trained. bf16 is faster on a processor that has
+    such products; one that is not faster with them, which is tried once, takes fp32."""
     levels: int = 0
-    """Levels of the position's encoding that are kept, from the lowest; 0: all. Of 11, 10: 67.5 dB to the render
-    with all; 9: 52.5 dB."""
+    """Levels of the position's encoding that are kept, from the lowest; 0: all. Fewer blur what is fine."""
 
     def __post_init__(self) -> None:
         for name in ("occupancy", "skipped_rounds", "levels"):

@@ -97,13 +97,13 @@ class TrainConfig:
     wrong, 2 for wrong usage, 130 or 143 when interrupted (after a checkpoint).
     """
 
-    shards: Annotated[Path, tyro.conf.Positional]
+    shards: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHARDS")]
     """Folder of the shards."""
     output: Path = Path("prior")
     """Folder of the prior."""
     preset: Literal["paper", "studio", "small", "tiny"] = "small"
-    """Which defaults all flags below have: the paper's; for a GPU; for two processor cores and half an hour; for
-    minutes."""
+    """Which defaults all flags below have: the paper's; for a GPU; for two processor cores and three quarters of
+    an hour; for minutes."""
     training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = field(default_factory=TrainingConfig)
     run: Annotated[RunConfig, tyro.conf.arg(name="")] = field(default_factory=RunConfig)
     model: ModelConfig = field(default_factory=ModelConfig)

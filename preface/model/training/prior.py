@@ -28,11 +28,12 @@ from preface.model.training.loop import TrainingError as TrainingError  # what `
 from preface.model.training.prior_files import MODEL_FILE, Prior, prior_payload, read_prior
 from preface.model.training.prior_loss import prior_terms, renderer
 from preface.model.training.products import chosen_products
-from preface.model.training.progress import Progress, duration, train_flops_per_ray
+from preface.model.training.progress import Progress, train_flops_per_ray
 from preface.model.training.ranks import Ranks, device_of_rank, joined_ranks
 from preface.model.training.schedule import LogLinear
 from preface.model.training.trainer import Options, Outcome, ParameterSet, Trainer
 from preface.model.training.validation import Validation, Viewer, interpolation_sheet, view_sheet
+from preface.plain_words import duration
 from preface.reports.pictures import Picture
 from preface.shards import Dataset, Loader, PaperPattern
 

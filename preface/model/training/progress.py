@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from preface.model.model import PriorModel
 from preface.model.networks import Trunk
 from preface.model.training.trainer import Outcome
+from preface.plain_words import duration
 
 
 def train_flops_per_ray(model: PriorModel) -> float:
@@ -94,10 +95,3 @@ class Progress:
             f"{values['rays_per_second']:>8,.0f} rays/s  {duration(left)} left  "
             f"{values['share_of_peak']:.0%} of the matmul peak"
         )
-
-
-def duration(seconds: float) -> str:
-    """A time in the unit that suits it."""
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

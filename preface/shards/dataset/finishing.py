@@ -17,7 +17,7 @@ from preface.shards.building import build_manifest, claim
 from preface.shards.dataset.croissant import CROISSANT_FILE, croissant
 from preface.shards.dataset.data_card import CARD_FILE, Contents, data_card
 from preface.shards.dataset.heads import mask_figures
-from preface.shards.dataset.people import TEMPLATE_INPUT, LeftOut, People
+from preface.shards.dataset.people import TEMPLATE_INPUT, LeftOut, People, persons_of
 from preface.shards.dataset.plan import ShardTask, splits
 from preface.shards.dataset.tasks import TaskResult
 from preface.shards.format import shard_name, shard_number
@@ -114,7 +114,7 @@ def finish(
     """
     folder, configuration = built.tasks[0].folder, built.tasks[0].configuration
     identities = [identity for result in built.results for identity in result.identities]
-    divided = splits(identities, holdout, seed, source, people.persons)
+    divided = splits(identities, holdout, seed, source, persons_of(people.capture))
     choices = built.tasks[0].choices
     left_out = [*people.left_out, *built.left_out]
     settings: dict[str, Any] = {

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from preface.align.alignment_files import TEMPLATE_FILE, AlignmentIndex, read_index
+from preface.align.alignment_files import TEMPLATE_FILE, AlignedEntry, AlignmentIndex, read_index
 from preface.align.person_file import Alignment, read_alignment
 from preface.artifacts import ArtifactError, sha256
 from preface.capture.images import IMAGE_SUFFIXES, read_header
@@ -96,6 +96,37 @@ class Person:
 
 
 @dataclass(frozen=True, eq=False)
+class Candidates:
+    """Who may be in a dataset, as the capture's manifest and the alignment's index tell: no photograph, and no
+    person's alignment has been opened.
+
+    Attributes:
+        capture: what they are from.
+        alignment: the folder.
+        index: of the alignment.
+        subjects: those that were asked for, in the capture's order, aligned or not.
+    """
+
+    capture: Capture
+    alignment: Path
+    index: AlignmentIndex
+    subjects: tuple[Subject, ...]
+
+    @property
+    def aligned(self) -> Mapping[str, AlignedEntry]:
+        """Identity -> entry of those who are aligned; everybody who will be in the dataset is among them."""
+        entries = {entry.identity: entry for entry in self.index.aligned}
+        return {subject.id: entries[subject.id] for subject in self.subjects if subject.id in entries}
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras that have a photograph of one of these, in the capture's order."""
+        aligned = self.aligned
+        seen = {camera for identity, camera in self.capture.images if identity in aligned}
+        return tuple(camera.id for camera in self.capture.manifest.cameras if camera.id in seen)
+
+
+@dataclass(frozen=True, eq=False)
 class People:
     """Everybody who can be used, in the capture's order.
 
@@ -113,46 +144,53 @@ class People:
     left_out: tuple[LeftOut, ...]
     inputs: Mapping[str, Path]
 
-    @property
-    def persons(self) -> Mapping[str, str]:
-        """Identity -> person, where an imported capture has several identities of one person, as expressions."""
-        return self.capture.manifest.metadata.get("imported", {}).get("people", {})
+
+def persons_of(capture: Capture) -> Mapping[str, str]:
+    """Identity -> person, where an imported capture has several identities of one person, as expressions."""
+    return capture.manifest.metadata.get("imported", {}).get("people", {})
 
 
-def find_people(
-    source: Path,
-    alignment: Path,
-    rigs: Mapping[str, tuple[Path, Rig]],
-    only: Sequence[str] | None,
-    max_pixels: int,
-    masks: Path | None = None,
-) -> People:
-    """Find the people of a capture, or the one in a folder of photographs.
+def find_candidates(
+    source: Path, alignment: Path, only: Sequence[str] | None, masks: Path | None = None
+) -> Candidates:
+    """Find the people of a capture, or the one in a folder of photographs, without looking at them.
 
     Args:
         source: the capture, or the folder that `preface-align photos` was given.
         alignment: the folder of the alignment.
-        rigs: take -> file and rig.
         only: these people, None for all.
-        max_pixels: photographs of more are left out.
         masks: of a folder of photographs, the folder of their masks, which have their names.
 
     Raises:
-        ArtifactError: a malformed file, a rig other than the alignment's, or somebody who is not there.
-        KeyError: a take without a rig.
+        ArtifactError: a malformed manifest or index, or somebody who is not there.
     """
     index = read_index(alignment)
     capture = read_capture(source) if is_capture(source) else capture_of_photographs(source, index, masks)
+    return Candidates(capture, alignment, index, tuple(chosen_subjects(source, capture, only)))
+
+
+def find_people(candidates: Candidates, rigs: Mapping[str, tuple[Path, Rig]], max_pixels: int) -> People:
+    """Look at the alignment of each candidate and at the headers of the photographs, which takes a while for many.
+
+    Args:
+        candidates: see `find_candidates`.
+        rigs: take -> file and rig.
+        max_pixels: photographs of more are left out.
+
+    Raises:
+        ArtifactError: a malformed file, or a rig other than the alignment's.
+        KeyError: a take without a rig.
+    """
+    capture, alignment, index = candidates.capture, candidates.alignment, candidates.index
     inputs = {f"rigs/{take}.json": file for take, (file, _) in rigs.items()}
     inputs[TEMPLATE_INPUT] = alignment / TEMPLATE_FILE
     if not capture.inferred:
         inputs[FILE_NAME] = capture.directory / FILE_NAME
-    subjects = chosen_subjects(source, capture, only)
-    aligned = {entry.identity: entry for entry in index.aligned}
+    aligned = candidates.aligned
     excluded = {entry.identity: entry.reason for entry in index.excluded}
     people: list[Person] = []
     left_out: list[LeftOut] = []
-    for subject in subjects:
+    for subject in candidates.subjects:
         if subject.id not in aligned:
             why = excluded.get(subject.id, "it is not in the alignment")
             left_out.append(LeftOut(subject.id, None, f"not aligned: {why}"))

@@ -6,16 +6,16 @@ import hashlib
 import os
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from preface.artifacts import ArtifactError
 from preface.capture.foreground import Choice, choose
 from preface.capture.preparation import PreparationError, framing_window
-from preface.geometry import GeometryError
+from preface.geometry import Camera, GeometryError
 from preface.plain_words import suggestion
-from preface.shards.dataset.configuration import BuildConfiguration
+from preface.shards.dataset.configuration import BuildConfiguration, Framing
 from preface.shards.dataset.heads import HeadMaker
 from preface.shards.dataset.people import People, Person
 from preface.shards.format import CHANNELS, Layout
@@ -76,6 +76,11 @@ def people_per_shard(views: int, width: int, height: int) -> int:
     return max(1, min(SHARD_PEOPLE, SHARD_BYTES // (views * width * height * CHANNELS)))
 
 
+def shard_count(people: int, configuration: BuildConfiguration) -> int:
+    """How many shards so many people make."""
+    return -(-people // configuration.identities_per_shard)
+
+
 def foreground_choices(people: People, configuration: BuildConfiguration) -> dict[str, Choice]:
     """How the foreground of each take is found.
 
@@ -88,25 +93,30 @@ def foreground_choices(people: People, configuration: BuildConfiguration) -> dic
     return {take: choose(people.capture, take, method, model, names) for take in takes}
 
 
-def check_framing(people: People, configuration: BuildConfiguration) -> None:
-    """Refuse a resolution or framing that no camera can have, before photographs are decoded.
+def check_framing(lenses: Iterable[Camera], size: tuple[int, int], framing: Framing) -> None:
+    """Refuse a resolution or framing that no camera can have, before photographs are looked at.
 
     Where some cameras can have it, tasks leave the others out.
+
+    Args:
+        lenses: of the cameras.
+        size: width and height of all views of the dataset, pixels.
+        framing: of these.
 
     Raises:
         PreparationError: what the first camera says.
     """
-    if configuration.framing == "box":  # depends on the person
+    if framing == "box":  # depends on the person
         return
-    lenses = {view.rig_camera.camera for person in people.people for view in person.views}
     problems = []
-    for lens in sorted(lenses, key=lambda lens: (lens.width, lens.height)):
+    for lens in sorted(set(lenses), key=lambda lens: (lens.width, lens.height)):
         try:
-            framing_window(lens, configuration.size, configuration.framing)
+            framing_window(lens, size, framing)
             return
         except PreparationError as error:
             problems.append(error)
-    raise problems[0]
+    if problems:
+        raise problems[0]
 
 
 def shard_tasks(

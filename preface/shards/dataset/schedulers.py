@@ -8,10 +8,16 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from typing import TYPE_CHECKING
 
 from preface.artifacts import ArtifactError
+from preface.shards.dataset.finishing import Runner
 from preface.shards.dataset.plan import ShardTask
 from preface.shards.dataset.tasks import TaskResult, run_task, use_one_thread
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 # What numerical libraries read when a process starts: processes are as many as cores.
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -41,20 +47,21 @@ def run_local(tasks: Sequence[ShardTask], jobs: int) -> Iterator[TaskResult]:
             pool.shutdown(cancel_futures=True)
 
 
-def run_dask(tasks: Sequence[ShardTask], address: str | None, jobs: int) -> Iterator[TaskResult]:
-    """Run tasks on a Dask cluster; its workers must see the capture and the dataset's folder under the tasks' paths.
+@contextlib.contextmanager
+def dask_cluster(address: str | None, jobs: int) -> Iterator[Runner]:
+    """What runs tasks on a Dask cluster, as long as the context lasts.
+
+    Its workers must see the capture and the dataset's folder under the tasks' paths.
 
     Args:
-        tasks: what to run.
         address: of the cluster's scheduler, such as ``tcp://host:8786``; None starts a cluster on this machine.
         jobs: processes of a cluster on this machine.
 
     Raises:
-        ArtifactError: as `run_task`, Dask is not installed, or the cluster does not answer.
+        ArtifactError: Dask is not installed, or the cluster does not answer; of tasks, as `run_task`.
     """
     try:
         from distributed import Client
-        from distributed import as_completed as completed
     except ImportError as error:
         problem = f"Dask is not installed ({error})"
         raise ArtifactError(
@@ -72,10 +79,16 @@ def run_dask(tasks: Sequence[ShardTask], address: str | None, jobs: int) -> Iter
             "--scheduler", "dask", problem, "Correct the address, or start the cluster"
         ) from error
     with client:
-        # Tasks are pure in Dask's sense only as long as nobody touches the files: each call is its own.
-        futures = client.map(run_task, list(tasks), pure=False, retries=1)
-        for future in completed(futures):
-            yield future.result()
+        yield partial(_run_dask, client)
+
+
+def _run_dask(client: Client, tasks: Sequence[ShardTask]) -> Iterator[TaskResult]:
+    from distributed import as_completed as completed
+
+    # Tasks are pure in Dask's sense only as long as nobody touches the files: each call is its own.
+    futures = client.map(run_task, list(tasks), pure=False, retries=1)
+    for future in completed(futures):
+        yield future.result()
 
 
 @contextlib.contextmanager

@@ -20,6 +20,7 @@ from preface.model.evaluation.sheets import (
     view_pictures,
 )
 from preface.model.evaluation.views import Square
+from preface.model.rendering.showing import depth_entry, error_entry, normals_entry
 from preface.model.training.prior_files import read_prior
 
 SQUARE = Square(5, 10, 20)
@@ -89,6 +90,21 @@ def test_a_sheet_without_normals_has_a_column_less():
         whole = sheet([picture, picture])
         assert (whole == [128, 128, 255]).all(axis=-1).any() == has
         assert (whole == [128, 128, 128]).all(axis=-1).sum() >= 2 * 150 * 200
+
+
+def test_a_sheet_says_what_its_colours_mean():
+    """Below the tiles are the bars of depth and error, whole, and the ball of normals only where there are normals."""
+
+    def colours(picture):
+        return {tuple(color) for color in picture.reshape(-1, 3).tolist()}
+
+    shown, plain = view_pictures(a_view()), view_pictures(a_view(normals=None))
+    assert shown.depths == pytest.approx((1 - DEPTH_SHOWN, 1 + DEPTH_SHOWN))
+    for entry in (depth_entry("", ""), error_entry()):
+        assert colours(entry[1]) <= colours(sheet([shown])) & colours(sheet([plain]))
+    ball = colours(normals_entry()[1])
+    assert ball <= colours(sheet([shown]))
+    assert not ball <= colours(sheet([plain]))
 
 
 def test_a_view_without_a_face_has_no_tile_on_the_sheet_of_faces():

@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from preface.model.rendering.showing import ERROR_SHOWN, error_picture, normals_picture, tile_size
+from preface.model.rendering.showing import (
+    ERROR_SHOWN,
+    depth_entry,
+    depth_picture,
+    error_entry,
+    error_picture,
+    normals_entry,
+    normals_picture,
+    tile_size,
+)
 
 
 def test_errors_grow_brighter_up_to_the_one_that_is_shown_last():
@@ -21,6 +30,28 @@ def test_axes_of_normals_are_red_green_and_blue_and_none_is_black():
         assert picture[axis + 3, axis] == 0
         assert set(np.delete(picture[axis], axis)) <= {127, 128}
     assert (picture[6] == 0).all()
+
+
+def test_legends_have_the_colours_of_the_pictures_from_one_end_to_the_other():
+    depths = np.linspace(0.8, 1.2, 160)[None]
+    before, bar, after = depth_entry("0.80 m", "1.20 m")
+    np.testing.assert_array_equal(bar[0], depth_picture(depths, 0.8, 1.2)[0])
+    assert before.endswith("0.80 m")
+    assert after.startswith("1.20 m")
+    errors = np.linspace(0, ERROR_SHOWN, 160)[None, :, None].repeat(3, 2)
+    np.testing.assert_array_equal(error_entry()[1][0], error_picture(errors, np.zeros_like(errors))[0])
+
+
+def test_the_legend_of_normals_is_a_ball_from_the_front_whose_right_is_the_subjects_left():
+    _, ball, words = normals_entry()
+    side = len(ball)
+    middle, edge = side // 2, 3
+    assert words.startswith("red: to the subject's left, green: up, blue: out of the face")
+    for row, column, channel in ((middle, side - edge, 0), (edge, middle, 1), (middle, middle, 2)):
+        assert ball[row, column].argmax() == channel
+    for row, column, channel in ((middle, edge, 0), (side - edge, middle, 1)):
+        assert ball[row, column].argmin() == channel
+    assert (ball[0, 0] == 0).all()
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from preface.capture.manifest import CaptureCamera, Manifest, Subject, Take, wri
 from preface.capture.rig import Rig, RigCamera, write_rig
 from preface.geometry import Camera, Rigid, Similarity
 from preface.geometry.transforms import nearest_rotation
-from preface.shards.dataset.people import People, find_people
+from preface.shards.dataset.people import People, find_candidates, find_people
 
 CAMERAS = made_up_studio.CAMERAS
 WIDTH, HEIGHT = 96, 128
@@ -136,7 +136,8 @@ def align(places, names, excluded=(), of_rig=None):
 def found(places, **options) -> People:
     """The people of the studio."""
     chosen = {"only": None, "max_pixels": 10**9, **options}
-    return find_people(places.capture, places.alignment, {TAKE: (places.rig, rig())}, **chosen)
+    candidates = find_candidates(places.capture, places.alignment, chosen["only"])
+    return find_people(candidates, {TAKE: (places.rig, rig())}, chosen["max_pixels"])
 
 
 def contents(folder):

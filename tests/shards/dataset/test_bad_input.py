@@ -22,19 +22,6 @@ from preface.shards import Dataset, verify
 ROOT = Path(__file__).parents[3]
 
 
-@pytest.fixture(scope="session")
-def studio(tmp_path_factory):
-    """Three people; not to be changed."""
-    return write_studio(tmp_path_factory.mktemp("studio"))
-
-
-@pytest.fixture
-def own(studio, tmp_path):
-    """A studio that may be changed."""
-    copy = shutil.copytree(studio.capture.parent, tmp_path / "own")
-    return made_up_capture.Places(copy / "capture", copy / "rig.json", copy / "alignment")
-
-
 def photograph(own, person="p1", camera="left"):
     return own.capture / "subjects" / person / f"{camera}.png"
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import made_up_capture
 import numpy as np
 import pytest
-from made_up_capture import CAMERAS, contents, write_studio
+from made_up_capture import CAMERAS, contents
 
 from preface.artifacts import sha256
 from preface.capture.images import read_image, write_png
@@ -23,19 +23,6 @@ from preface.shards.dataset.heads import HeadMaker
 from preface.shards.dataset.plan import splits
 
 ROOT = Path(__file__).parents[3]
-
-
-@pytest.fixture(scope="session")
-def studio(tmp_path_factory):
-    """Three people; not to be changed."""
-    return write_studio(tmp_path_factory.mktemp("studio"))
-
-
-@pytest.fixture
-def own(studio, tmp_path):
-    """A studio that may be changed."""
-    copy = shutil.copytree(studio.capture.parent, tmp_path / "own")
-    return made_up_capture.Places(copy / "capture", copy / "rig.json", copy / "alignment")
 
 
 @pytest.fixture(scope="session")

@@ -1,32 +1,16 @@
 """The command itself: what it refuses, what it says, and how `preface-inspect` shows and verifies its dataset."""
 
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
-import made_up_capture
 import pytest
-from made_up_capture import write_studio
 
 from preface.cli import inspect
 from preface.cli.build_shards import main
 
 ROOT = Path(__file__).parents[3]
-
-
-@pytest.fixture(scope="session")
-def studio(tmp_path_factory):
-    """Three people; not to be changed."""
-    return write_studio(tmp_path_factory.mktemp("studio"))
-
-
-@pytest.fixture
-def own(studio, tmp_path):
-    """A studio that may be changed."""
-    copy = shutil.copytree(studio.capture.parent, tmp_path / "own")
-    return made_up_capture.Places(copy / "capture", copy / "rig.json", copy / "alignment")
 
 
 def test_dry_run_writes_nothing_and_says_what_it_would_take(own, tmp_path, capsys):

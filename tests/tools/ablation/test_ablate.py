@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import shutil
 from pathlib import Path
 
 import ball_heads
@@ -13,6 +14,7 @@ import torch
 import ablate
 from ablation import running
 from ablation.priors import halved_shards, nested, subset_shards
+from preface.artifacts import load_json, write_artifact
 from preface.model.training.loop import Ended
 from preface.model.training.prior import train_prior
 from preface.model.training.prior_files import read_prior
@@ -159,11 +161,38 @@ def test_half_the_resolution_sees_the_same_with_a_quarter_of_the_pixels(shards, 
             np.testing.assert_allclose(half.pixels(1, 3)[..., 3], means, atol=0.51)
 
 
+def test_names_are_the_same_people_only_in_the_shards_that_the_prior_was_trained_on(
+    shards, prior, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.syspath_prepend(Path(small_runs.__file__).parents[1] / "evaluation")
+    from untrained import write_model
+
+    with Dataset(shards) as dataset:
+        everybody = list(dataset.names)
+    elsewhere = write_model(tmp_path / "elsewhere", everybody)
+    asked = ["--only", "regularisers", *CHEAP, "--plan"]
+    assert run(shards, elsewhere, tmp_path / "out", *asked) == 1
+    said = capsys.readouterr().err
+    assert "which was trained on other shards, knows everybody's name" in said
+    assert f"--identities {' '.join(everybody[:3])}" in said
+    # The prior of these shards, as if it were one of others.
+    trained = Path(shutil.copytree(prior, tmp_path / "trained"))
+    content = load_json(trained / "model.json")
+    content["provenance"]["inputs"]["manifest.json"] = "0" * 64
+    write_artifact(trained / "model.json", content)
+    known = content["identities"][0]
+    assert run(shards, trained, tmp_path / "out", *asked, "--identities", known) == 0
+    assert f"'{known}', from other shards; taken for another person" in capsys.readouterr().err
+
+
 def test_smaller_priors_need_the_people_of_the_full_one(shards, tmp_path, capsys, monkeypatch):
     monkeypatch.syspath_prepend(Path(small_runs.__file__).parents[1] / "evaluation")
     from untrained import write_model
 
     strangers = write_model(tmp_path / "prior", ["somebody", "else"])
+    namesakes = write_model(tmp_path / "namesakes", ["id0001", "id0002"])
+    assert run(shards, namesakes, tmp_path / "out", *CHOICE, *CHEAP, "--plan") == 1
+    assert "are not those that the prior was trained on" in capsys.readouterr().err
     assert run(shards, strangers, tmp_path / "out", *CHOICE, *CHEAP, "--plan") == 1
     said = capsys.readouterr().err
     assert "'somebody', whom the prior was trained on, is not there" in said

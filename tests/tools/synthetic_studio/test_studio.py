@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -15,11 +16,14 @@ import numpy as np
 import pytest
 import sphere_head
 
+from preface import progress
 from preface.capture.images import read_exr, read_header, read_image
 from preface.capture.manifest import read_capture
 from preface.capture.rig import read_rig
 from preface.geometry.transforms import Rigid
+from synthetic_studio import estimate
 from synthetic_studio.config import BoardConfig, SensorConfig, StudioConfig, StudioError
+from synthetic_studio.tasks import Studio, missing_tasks
 from synthetic_studio.writer import write_studio
 
 HERE = Path(__file__).parent
@@ -161,6 +165,32 @@ def test_an_interrupted_studio_is_finished_byte_for_byte(finished, copy):
     (copy / "capture" / "subjects" / "id0001" / ".cam02.png.0123456789ab.tmp").write_bytes(b"half an im")
     make(copy)
     assert contents(copy) == contents(finished)
+
+
+def test_a_log_tells_what_is_to_be_made_and_how_far_it_is(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN", 0.0)
+    monkeypatch.setattr(progress, "SHARE_BETWEEN", 0.0)
+    make(tmp_path / "out", identities=1, takes=1, clean_plates=False, jobs=1)
+    lines = capsys.readouterr().err.splitlines()
+    assert re.fullmatch(r"9 images to make with 1 worker, about \d+ s by the studio's cost model", lines[0])
+    assert lines[-1].startswith("9 of 9 images, ")
+    assert any(re.fullmatch(r"[1-8] of 9 images, \d+ s, about \d+ s left", line) for line in lines[1:-1])
+    (tmp_path / "out" / "capture" / "subjects" / "id0000" / "cam01.png").unlink()
+    make(tmp_path / "out", identities=1, takes=1, clean_plates=False, jobs=1)
+    assert capsys.readouterr().err.startswith("1 image to make with 1 worker")
+
+
+def test_the_steps_of_tasks_add_up_to_the_estimate(tmp_path):
+    config = dataclasses.replace(SMALL, output=tmp_path)
+    studio = Studio(config, "sphere_head")
+    tasks = missing_tasks(studio)
+    for task in tasks:
+        steps = list(task.steps(studio))
+        assert sum(step.images for step in steps) == task.images
+        assert sum(step.seconds for step in steps) == pytest.approx(task.seconds(config))
+    whole, workers = estimate.estimate(config), config.workers * estimate.START
+    assert sum(task.seconds(config) for task in tasks) + workers == pytest.approx(whole.seconds)
+    assert sum(task.images for task in tasks) == whole.images
 
 
 def test_finished_images_are_not_made_again(copy):
