@@ -188,7 +188,7 @@ def test_a_run_that_ended_before_its_first_checkpoint_goes_on(balls, tmp_path, m
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "PATH"),
+        ([], "SHARDS"),
         (["shards", "--stps", "3"], "--stps, 3; perhaps --steps was meant"),
         (["shards", "--preset", "huge"], "'huge'"),
         (["shards", "--steps", "many"], "--steps: invalid"),
