@@ -3,7 +3,7 @@
 # pictures of a board, aligns its people, builds shards of them, trains a tiny prior on all but one of them, fits the
 # one that it has not seen from two photographs, with the prior and without, renders the head from side to side,
 # measures it on the photographs that were kept away and its surface against the studio's. Then it fits the same person
-# from the prior that comes with preface, which has seen more people, and shows all of it on one page. About twelve
+# from the prior that comes with preface, which has seen more people, and shows all of it on one page. About ten
 # minutes on two cores, and five for the set-up the first time. Every stage prints the command that it runs. Run again,
 # it resumes where it stopped; delete OUTPUT to begin anew.
 # Prints the path of the page last.
@@ -40,7 +40,7 @@ else
     people=13
     studio=(--identities "$people")
     fitted=$(printf 'id%04d' $((people - 1))) # the last of them
-    minutes=(2.1 0.1 0.8 0.9 0.5 1.9 0.7 0.5 0.4 1.0 0.5 0.1 0.1 0.9 0.6 0.7 0.4 0.1)
+    minutes=(2.0 0.0 0.7 0.6 0.5 1.4 0.5 0.5 0.3 0.8 0.4 0.1 0.1 0.6 0.3 0.5 0.3 0.1)
 fi
 views=(cam04 cam05)
 surfaces=(cam00 cam02 cam07) # in front, to the side and from above; not fitted to
