@@ -21,7 +21,7 @@ from preface.model.training.logs import LOG_FILE, read_log
 from preface.model.training.prior_files import read_prior
 
 # A path from the root or from home: "/data/studio", but neither "1/2" nor "a / b" nor what follows "https:".
-_PATH = re.compile(r"(?<![\w.)/])~?/(?:[\w.@+-]+/)*([\w.@+-]+)/?")
+_PATH = re.compile(r"(?<![\w.)/@+-])~?/(?:[\w.@+-]+/)*([\w.@+-]+)/?")
 TRAINING = "training"  # the source that is a folder
 
 
