@@ -82,18 +82,15 @@ class CameraCorrections(nn.Module):
         turn, shift = self.rotation[view], self.translation[view]
         origins = rays.origins + shift
         directions, viewdirs = rotated(turn, rays.directions), rotated(turn, rays.viewdirs)
-        scaled = Box(box.minimum * scene_scale, box.maximum * scene_scale)
-        near, far, hit = (x[:, None] for x in scaled.intersect(origins.detach(), directions.detach()))
-        before = torch.ones_like(hit) if rays.hit is None else rays.hit
+        moved = rays_between_faces(rays, origins, directions, viewdirs, box, scene_scale)
+        assert moved.hit is not None
+        before = torch.ones_like(moved.hit) if rays.hit is None else rays.hit
         still = ((turn == 0) & (shift == 0)).all(dim=-1, keepdim=True)
         return replace(
-            rays,
-            origins=origins,
-            directions=directions,
-            viewdirs=viewdirs,
-            near=torch.where(hit & ~still, near, rays.near),
-            far=torch.where(hit & ~still, far, rays.far),
-            hit=torch.where(still, before, hit),
+            moved,
+            near=torch.where(still, rays.near, moved.near),
+            far=torch.where(still, rays.far, moved.far),
+            hit=torch.where(still, before, moved.hit),
         )
 
     def penalty(
@@ -125,6 +122,34 @@ class CameraCorrections(nn.Module):
             camera: {"rotation": turn, "translation_m": shift}
             for camera, turn, shift in zip(cameras, turns, shifts, strict=True)
         }
+
+
+def rays_between_faces(
+    rays: Rays, origins: Tensor, directions: Tensor, viewdirs: Tensor, box: Box, scene_scale: float
+) -> Rays:
+    """Rays that were moved, between the faces of the box as they are now.
+
+    Args:
+        rays: n of them, before they were moved.
+        origins, directions, viewdirs: [n, 3], after it, scene units.
+        box: canonical frame, metres.
+        scene_scale: scene units per metre.
+
+    Returns:
+        Rays with `near`, `far` and `hit` as `Box.intersect` gives them, without derivatives; those that miss the box
+        keep the near and far that they had.
+    """
+    scaled = Box(box.minimum * scene_scale, box.maximum * scene_scale)
+    near, far, hit = (x[:, None] for x in scaled.intersect(origins.detach(), directions.detach()))
+    return replace(
+        rays,
+        origins=origins,
+        directions=directions,
+        viewdirs=viewdirs,
+        near=torch.where(hit, near, rays.near),
+        far=torch.where(hit, far, rays.far),
+        hit=hit,
+    )
 
 
 def corrected_pose(canonical_from_camera: Rigid, correction: Mapping[str, Any]) -> Rigid:

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from preface.geometry import Box
 from preface.model import losses
-from preface.model.fitting.cameras import rotated
+from preface.model.fitting.cameras import rays_between_faces, rotated
 from preface.model.fitting.heads import code_of
 from preface.model.model import PriorModel, Render
 from preface.model.rays import Rays
@@ -52,9 +51,11 @@ def interlevel_elsewhere(
         drawn = torch.from_numpy(jitter(seed, part.step, part.first, len(batch), rounds + 2, _STREAM)).to(
             device
         )
-        rays = turned_about(Rays.from_batch(batch), 2 * drawn[:, :2] - 1, box, scale)
+        chosen = _chosen(part, share).nonzero()[:, 0].to(device)
+        drawn = drawn[chosen]
+        rays = turned_about(Rays.from_batch(batch)[chosen], 2 * drawn[:, :2] - 1, box, scale)
         assert rays.hit is not None
-        met = (_chosen(part, share).to(device) & rays.hit[:, 0]).nonzero()[:, 0]
+        met = rays.hit[:, 0].nonzero()[:, 0]
         *proposals, last = model.rounds(rays[met], code_of(model), jitter=drawn[met, 2:])
         known = ((level.sdist, level.weights) for level in proposals)
         return losses.interlevel(last.sdist, last.weights, known) * (len(met) / (share * len(batch)))
@@ -80,8 +81,7 @@ def turned_about(rays: Rays, turns: Tensor, box: Box, scale: float) -> Rays:
     Returns:
         Rays with `near`, `far` and `hit` as `Box.intersect` gives them; those that miss the box keep near and far.
     """
-    scaled = Box(box.minimum * scale, box.maximum * scale)
-    centre = torch.as_tensor((scaled.minimum + scaled.maximum) / 2).to(rays.origins)
+    centre = torch.as_tensor((box.minimum + box.maximum) / 2 * scale).to(rays.origins)
     none = torch.zeros_like(turns[:, 0])
     tilt = torch.stack([_TILT * turns[:, 1], none, none], dim=-1)
     turn = torch.stack([none, _TURN * turns[:, 0], none], dim=-1)
@@ -90,13 +90,4 @@ def turned_about(rays: Rays, turns: Tensor, box: Box, scale: float) -> Rays:
         return rotated(turn, rotated(tilt, vectors))
 
     origins, directions = moved(rays.origins - centre) + centre, moved(rays.directions)
-    near, far, hit = (x[:, None] for x in scaled.intersect(origins, directions))
-    return replace(
-        rays,
-        origins=origins,
-        directions=directions,
-        viewdirs=moved(rays.viewdirs),
-        near=torch.where(hit, near, rays.near),
-        far=torch.where(hit, far, rays.far),
-        hit=hit,
-    )
+    return rays_between_faces(rays, origins, directions, moved(rays.viewdirs), box, scale)
